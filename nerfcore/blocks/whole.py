@@ -11,7 +11,7 @@ import numpy as np
 from ..data.load import load_scene
 from ..data.scene import Scene
 from ..errors import TrainingError
-from ..files import atomic_path, staged
+from ..files import atomic_path
 from ..geometry.similarity import similarity_scale, transform_points
 from ..images.encode import write_picture
 from ..kernels.closest import ClosestPoints
@@ -19,13 +19,14 @@ from ..mesh.build import not_refuted
 from ..mesh.features import features_of
 from ..mesh.instances import GAP, find_instances, with_earlier_joins, with_earlier_names, write_instances
 from ..mesh.lods import level_files, make_levels, write_level
+from ..mesh.outputs import Places
 from ..mesh.painted import training_photos, unwrapped
 from ..mesh.parts import texture_of
 from ..mesh.photo_texture import photo_texture, prepare
 from ..mesh.stored import MESH, TEXTURE
 from ..mesh.surface import Surface, class_table, to_world, with_faces
 from ..mesh.triangles import area_share
-from ..mesh.turntable import write_turntable
+from ..mesh.turntable import look_around, write_pictures
 from ..mesh.verb import earlier_instances
 from ..params import BlocksParams
 from ..progress import Reporter
@@ -80,33 +81,39 @@ def write_whole(folder: Path, plan: Plan, params: BlocksParams, report: Reporter
     painted = None if params.texture is None else paint(common, plan, scene, params.texture, report)
     texture = None if painted is None else texture_of(surface.faces, painted.uv, painted.image)
     levels = make_levels(surface, texture, params.lods, report)
+    pictures: dict[str, np.ndarray] = {}
+    if params.turntable is not None:
+        report.stage("Looking at it")
+        pictures = look_around(surface, texture, {c.id: c.color for c in scene.classes}, report)
+    rows = [_row(folder, plan, number, len(part.surface.faces)) for number, part in enumerate(parts)]
     report.stage("Writing")
     revision = map_revision(load_project(folder))
     features = features_of(surface, scene.classes, scene.ignore_id, instances, revision)
-    with staged(target) as here:
-        written = _write_arrays(here, surface, filled, painted) + [write_instances(here, instances)]
-        written += write_surface(here / "mesh.ply", surface, features, "none", check=report.check)
+    with Places() as places:
+        here = places.waiting(target)
+        there = here if out is None else places.waiting(out.parent)
+        files = _write_arrays(here, surface, filled, painted) + [write_instances(here, instances)]
+        files += write_surface(here / "mesh.ply", surface, features, "none", check=report.check)
+        if out is not None:
+            files += write_surface(there / out.name, surface, features, "none", texture, check=report.check)
         for number, level in enumerate(levels, 1):
-            written += write_level(here, number, level, report.check)
+            files += write_level(here, number, level, report.check)
+            if out is not None:
+                features = features_of(level.surface, scene.classes, scene.ignore_id, instances, revision)
+                path = there / f"{out.stem}_lod{number}{out.suffix}"
+                files += write_surface(path, level.surface, features, "none", level.texture, check=report.check)
+        if params.turntable is not None:
+            files += write_pictures(places.waiting(params.turntable), pictures, report)
         report.check()
-        kept = {path.name for path in written}
-        for name in (MESH_RECORD, MEASURES, SCENE_GRAPH):  # they are of the mesh before
+        # From here on nothing stops it. What these say is no longer true, and what has no successor goes.
+        written = {path.name for path in files if path.parent == here}
+        for path in [target / MESH_RECORD, target / MEASURES, target / SCENE_GRAPH, *level_files(target)]:
+            path.unlink(missing_ok=True)
+        for name in {TEXTURE, UNSEEN} - written:
             (target / name).unlink(missing_ok=True)
-        for path in [*level_files(target), *(target / name for name in (TEXTURE, UNSEEN))]:
-            if path.name not in kept:
-                path.unlink(missing_ok=True)
-    files = [target / path.name for path in written]
-    if out is not None:
-        files += write_surface(out, surface, features, "none", texture, check=report.check)
-        for number, level in enumerate(levels, 1):
-            features = features_of(level.surface, scene.classes, scene.ignore_id, instances, revision)
-            path = out.with_name(f"{out.stem}_lod{number}{out.suffix}")
-            files += write_surface(path, level.surface, features, "none", level.texture, check=report.check)
-    if params.turntable is not None:
-        report.stage("Looking at it")
-        files += write_turntable(params.turntable, surface, texture, {c.id: c.color for c in scene.classes}, report)
+    files = places.goals(files)
     result = {
-        "blocks": [_row(folder, plan, number, len(part.surface.faces)) for number, part in enumerate(parts)],
+        "blocks": rows,
         "vertices": len(surface.vertices),
         "faces": len(surface.faces),
         "open_at_seams": open_edges,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +13,6 @@ from ..data.box import Box
 from ..data.scene import Scene
 from ..files import atomic_path, staged
 from ..geometry.similarity import transform_points
-from ..images.encode import write_picture
 from ..params import MeshParams
 from ..progress import Reporter
 from ..project.runs import MEASURES, MESH_RECORD, SCENE_GRAPH
@@ -24,6 +24,7 @@ from .painted import MAPS, Painted, write_maps
 from .parts import Texture
 from .stored import COARSE, MESH, TEXTURE
 from .surface import Surface
+from .turntable import write_pictures
 
 
 @dataclass(frozen=True)
@@ -42,6 +43,24 @@ class Made:
     label_revision: int | None = None
 
 
+class Places(ExitStack):
+    """Folders in which files wait, see `staged`, until those for all folders are written."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._goals: dict[Path, Path] = {}
+
+    def waiting(self, folder: Path) -> Path:
+        """Where files for a folder are written first."""
+        place = self.enter_context(staged(folder))
+        self._goals[place] = folder
+        return place
+
+    def goals(self, files: Iterable[Path]) -> list[Path]:
+        """Where files that wait come to."""
+        return [self._goals[path.parent] / path.name for path in files]
+
+
 def write_outputs(target: Path, made: Made, scene: Scene, params: MeshParams, report: Reporter) -> list[Path]:
     """Write a mesh to its folder, to the file that was asked for, and its turntable. Nothing that was there is changed
     before everything is written.
@@ -53,16 +72,9 @@ def write_outputs(target: Path, made: Made, scene: Scene, params: MeshParams, re
     """
     from .files import write_surface  # with its libraries, a quarter of a second
 
-    with ExitStack() as stack:
-        places: dict[Path, Path] = {}  # where files are written first → the folder that they are for
-
-        def place(folder: Path) -> Path:
-            found = stack.enter_context(staged(folder))
-            places[found] = folder
-            return found
-
-        here = place(target)
-        there = place(params.out.parent) if params.out is not None else here
+    with Places() as places:
+        here = places.waiting(target)
+        there = places.waiting(params.out.parent) if params.out is not None else here
         files = _write_arrays(here, made) + [write_instances(here, made.instances)]
         files += write_maps(here, made.painted, {c.id: c.color for c in scene.classes}, report.check)
         surface = made.surface
@@ -79,12 +91,7 @@ def write_outputs(target: Path, made: Made, scene: Scene, params: MeshParams, re
             path = there / f"{base.stem}_lod{number}{base.suffix}"
             files += write_surface(path, level.surface, features, params.split, level.texture, check=report.check)
         if params.turntable is not None:
-            aside = place(params.turntable)
-            for name, picture in made.pictures.items():
-                report.check()
-                with atomic_path(aside / name) as temporary:
-                    write_picture(temporary, picture)
-                files.append(aside / name)
+            files += write_pictures(places.waiting(params.turntable), made.pictures, report)
         report.check()
         # From here on nothing stops it. What these say is no longer true, and what has no successor goes.
         written = {path.name for path in files if path.parent == here}
@@ -92,7 +99,7 @@ def write_outputs(target: Path, made: Made, scene: Scene, params: MeshParams, re
             path.unlink(missing_ok=True)
         for name in {TEXTURE, *MAPS} - written:
             (target / name).unlink(missing_ok=True)
-    return [places[path.parent] / path.name for path in files]
+    return places.goals(files)
 
 
 def _write_arrays(folder: Path, made: Made) -> list[Path]:

@@ -129,10 +129,16 @@ def write_turntable(
     """
     pictures = look_around(surface, texture, colors, report, class_map)
     with staged(folder) as place:
-        for name, picture in pictures.items():
-            report.check()
-            with atomic_path(place / name) as temporary:
-                write_picture(temporary, picture)
+        write_pictures(place, pictures, report)
+    return [folder / name for name in pictures]
+
+
+def write_pictures(folder: Path, pictures: dict[str, np.ndarray], report: Reporter) -> list[Path]:
+    """Write pictures (H, W, 3) uint8 by the names of their files and return these. Raises DiskError, Cancelled."""
+    for name, picture in pictures.items():
+        report.check()
+        with atomic_path(folder / name) as temporary:
+            write_picture(temporary, picture)
     return [folder / name for name in pictures]
 
 

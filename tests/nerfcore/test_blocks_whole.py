@@ -11,6 +11,8 @@ import trimesh
 from fieldwork.nerfcore.blocks.plan import PART, Plan, block_folder
 from fieldwork.nerfcore.blocks.surface import Part, save_part
 from fieldwork.nerfcore.blocks.whole import NAME, write_whole
+from fieldwork.nerfcore.errors import Cancelled, DiskError
+from fieldwork.nerfcore.files import file_hash
 from fieldwork.nerfcore.mesh.instances import read_instances, write_instances
 from fieldwork.nerfcore.mesh.surface import Surface
 from fieldwork.nerfcore.params import BlocksParams, InstancesParams
@@ -60,3 +62,47 @@ def test_names_and_joins_made_by_hand_stay_and_what_was_said_of_the_mesh_before_
     write_whole(folder, plan, params, Reporter())
     assert [(one.name, one.parts) for one in read_instances(target)] == [("dome", ()), ("lower.001", pieces)]
     assert not any((target / name).exists() for name in (MEASURES, SCENE_GRAPH))
+
+
+class Stops(Reporter):
+    """Cancels when a stage begins."""
+
+    def __init__(self, name: str) -> None:
+        super().__init__()
+        self.name = name
+
+    def stage(self, name: str) -> None:
+        super().stage(name)
+        if name == self.name:
+            self.cancel()
+
+
+@pytest.mark.parametrize("how", ["stopped", "no room"])
+def test_stopped_or_without_room_for_its_file_the_mesh_before_stays(asked: tuple[Plan, BlocksParams], how: str) -> None:
+    plan, params = asked
+    folder, target = params.project, params.project / "exports" / NAME
+    write_whole(folder, plan, params, Reporter())
+    instances(InstancesParams(project=folder, run=NAME, rename=["upper.001", "dome"]), Reporter())
+    before = {path.name: file_hash(path) for path in target.iterdir()}
+    (folder / "a file").touch()
+    if how == "stopped":
+        report, more, error = Stops("Looking at it"), {"turntable": folder / "around"}, Cancelled
+    else:
+        report, more, error = Reporter(), {"out": folder / "a file" / "mesh.glb"}, DiskError
+    with pytest.raises(error):
+        write_whole(folder, plan, params.model_copy(update=more), report)
+    assert {path.name: file_hash(path) for path in target.iterdir()} == before
+    write_whole(folder, plan, params, Reporter())
+    assert "dome" in [one.name for one in read_instances(target)]
+
+
+def test_files_and_pictures_come_to_their_folders(asked: tuple[Plan, BlocksParams]) -> None:
+    plan, params = asked
+    folder = params.project
+    everywhere = {"out": folder / "out" / "a.obj", "turntable": folder / "around", "lods": 1}
+    result = write_whole(folder, plan, params.model_copy(update=everywhere), Reporter())
+    target, files = folder / "exports" / NAME, {Path(file) for file in result["files"]}
+    wanted = [target / name for name in ("mesh.npz", "mesh.ply", "mesh_lod1.npz", "instances.json")]
+    wanted += [folder / "out" / "a.obj", folder / "out" / "a_lod1.obj", folder / "around" / "color_0.png"]
+    assert set(wanted) <= files
+    assert all(file.is_file() for file in files)

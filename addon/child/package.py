@@ -11,6 +11,7 @@ import bpy
 
 from ..roles import FOLDER
 from ..scene.build import Imported, import_package
+from ..scene.cameras import clip_range
 from ..scene.package import Package, read_package
 
 PACKED_LIMIT = 256 * 2**20  # bytes of photos above which they stay outside the .blend
@@ -25,7 +26,7 @@ def write_blend(request: dict[str, Any], emit: Callable[..., None]) -> dict[str,
     package, imported = _build(request, emit, "Building the Blender file")
     imported.root[FOLDER] = _seen_from(Path(request["project"]).absolute(), Path(request["out"]).absolute().parent)
     prepare_scene(bpy.context.scene, len(package.cameras))
-    _show_colors(imported)
+    _show_colors(imported, clip_range(package))
     warnings = imported.warnings
     size = sum((package.folder / camera["image"]).stat().st_size for camera in package.cameras)
     if size <= PACKED_LIMIT:
@@ -84,14 +85,14 @@ def prepare_scene(scene: bpy.types.Scene, frames: int) -> None:
     scene.unit_settings.system = "METRIC"
 
 
-def _show_colors(imported: Imported) -> None:
-    """Let every 3D viewport show the colours of the photos, flat, through the first camera."""
+def _show_colors(imported: Imported, clip: tuple[float, float]) -> None:
+    """Let every 3D viewport show the colours of the photos, flat, through the first camera, and all that is in a range."""
     for screen in bpy.data.screens:
         for area in screen.areas:
             for space in area.spaces:
                 if space.type == "VIEW_3D":
                     space.shading.type, space.shading.light, space.shading.color_type = "SOLID", "FLAT", "VERTEX"
-                    space.clip_end = 1000.0
+                    space.clip_start, space.clip_end = clip
                     space.overlay.show_relationship_lines = False  # one from every camera to the parent
                     if imported.cameras:
                         space.region_3d.view_perspective = "CAMERA"

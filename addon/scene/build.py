@@ -19,7 +19,7 @@ import bpy
 
 from ..render.slot import load_image
 from ..roles import Owner
-from .cameras import SIZE, animated_camera, display_size, photo_camera, use_size_of
+from .cameras import SIZE, animated_camera, clip_range, display_size, photo_camera, use_size_of
 from .edited import CAMERA_PATH, Steps
 from .frame import units_per_metre
 from .look import set_switch, shader_group, viewport_group
@@ -96,14 +96,14 @@ def import_steps(
     owned = Owned(place(), Owner(package.name, package.uuid))
     _parent(owned, package)
     owned.release_copies()
-    size = display_size(package)
+    size, clip = display_size(package), clip_range(package)
     roles: list[str] = []
     if cameras in {"many", "both"}:
         for index, entry in enumerate(package.cameras):
             yield 0.1 + 0.5 * index / len(package.cameras), entry["name"]
-            photo_camera(owned, entry, package, size)
+            photo_camera(owned, entry, package, size, clip)
     if cameras in {"animated", "both"} and package.cameras:
-        yield from animated_camera(owned, package, size)
+        yield from animated_camera(owned, package, size, clip)
     yield 0.7, "points"
     if len(package.xyz):
         yield from sparse_points(owned, package)

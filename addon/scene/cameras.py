@@ -18,13 +18,30 @@ from .package import SENSOR_MM, Package, blender_camera
 SIZE = "fieldwork_size"  # photo size in pixels, on camera objects
 ASPECT = "fieldwork_aspect"  # width and height of the photo's pixels, on camera objects
 PHOTO = "fieldwork_photo"  # marks the images that are photos
+NEAR, FAR = 0.01, 1000.0  # metres that cameras show at least
 
 
 def display_size(package: Package) -> float:
     """How large the cameras are drawn: a fortieth of what they span, in metres."""
-    centers = np.array([np.array(c["camera_to_world"])[:3, 3] for c in package.cameras])
-    extent = float(np.linalg.norm(centers.max(0) - centers.min(0))) if len(centers) else 0.0
-    return extent / 40 or 0.1
+    return _diagonal(_centers(package)) / 40 or 0.1
+
+
+def clip_range(package: Package) -> tuple[float, float]:
+    """From where to where cameras show something, in metres: all of the capture, however small or large it is."""
+    surface = package.mesh["vertices"] if package.mesh is not None else np.zeros((0, 3))
+    places = np.concatenate([_centers(package), package.xyz, surface])
+    some = places[:: max(1, len(places) // 10_000)]
+    size = _diagonal(np.percentile(some, (10, 90), axis=0)) if len(some) else 0.0  # without points far off
+    return min(NEAR, size / 100 or NEAR), max(FAR, 2 * _diagonal(places))
+
+
+def _centers(package: Package) -> np.ndarray:
+    return np.array([np.array(c["camera_to_world"])[:3, 3] for c in package.cameras]).reshape(-1, 3)
+
+
+def _diagonal(places: np.ndarray) -> float:
+    """Diagonal of the box around places (N, 3); 0 where there are none."""
+    return float(np.linalg.norm(np.ptp(places, axis=0))) if len(places) else 0.0
 
 
 def use_size_of(scene: bpy.types.Scene, entry: dict[str, Any]) -> None:
@@ -39,10 +56,13 @@ def pixel_aspect(entry: dict[str, Any]) -> tuple[float, float]:
     return blender_camera(entry).aspect if entry["model"] == "PINHOLE" else (1.0, 1.0)
 
 
-def photo_camera(owned: Owned, entry: dict[str, Any], package: Package, size: float) -> bpy.types.Object:
-    """The camera of a photo, with the photo and what was rendered of it behind it; beside one that the user moved."""
+def photo_camera(
+    owned: Owned, entry: dict[str, Any], package: Package, size: float, clip: tuple[float, float]
+) -> bpy.types.Object:
+    """The camera of a photo, with the photo and what was rendered of it behind it; beside one that the user moved.
+    `size`, `clip`: see `display_size`, `clip_range`."""
     role = f"camera:{entry['name']}"
-    item = _camera(owned, role, entry["name"], size)
+    item = _camera(owned, role, entry["name"], size, clip)
     data = item.data
     _set_lens(data, entry)
     item.matrix_parent_inverse = Matrix.Identity(4)
@@ -60,18 +80,19 @@ def photo_camera(owned: Owned, entry: dict[str, Any], package: Package, size: fl
     return item
 
 
-def _camera(owned: Owned, role: str, name: str, size: float) -> bpy.types.Object:
-    """The camera of a role, if need be a new one, drawn in this size."""
+def _camera(owned: Owned, role: str, name: str, size: float, clip: tuple[float, float]) -> bpy.types.Object:
+    """The camera of a role, if need be a new one, drawn in this size, that shows what is in this range."""
     found = owned.existing(role)
     if found is not None and camera_edited(found):
         owned.leave(role)
         found = None
     data = found.data if found else bpy.data.cameras.new(name)
     write_once(data, "display_size", size)
-    if found is None:
-        # Unlike places and sizes these do not follow the scale of the parent.
-        metre = units_per_metre(owned.scene)
-        data.clip_start, data.clip_end = 0.01 * metre, 1000.0 * metre
+    # Unlike places and sizes these do not follow the scale of the parent.
+    metre = units_per_metre(owned.scene)
+    for end, distance in zip(("clip_start", "clip_end"), clip):
+        if found is None or f"fieldwork_{end}" in data:  # of earlier versions nobody knows who chose it
+            write_once(data, end, distance * metre)
     return owned.object(role, name, data)
 
 
@@ -87,9 +108,9 @@ def _show_photo(data: bpy.types.Camera, path: Path) -> None:
     slot.image[PHOTO] = True
 
 
-def animated_camera(owned: Owned, package: Package, size: float) -> Steps:
+def animated_camera(owned: Owned, package: Package, size: float, clip: tuple[float, float]) -> Steps:
     """One camera that stands at the n-th photo's place in frame n; beside one whose keys the user changed. Returns it."""
-    item = _camera(owned, CAMERA_PATH, "Photographer", size)
+    item = _camera(owned, CAMERA_PATH, "Photographer", size, clip)
     item.animation_data_clear()
     item.data.animation_data_clear()
     item.rotation_mode = "QUATERNION"

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import json
+
+import numpy as np
 import pytest
 from fieldwork.tests.addon.support import SETUP, make_posed_project
 from fieldwork.tests.addon.test_mesh_import import make_package
@@ -88,6 +91,46 @@ answer({"width": width * metres, "scale": list(imported.root.scale),
     assert facts["width"] == pytest.approx(0.95, rel=1e-4)
     assert facts["scale"] == pytest.approx([1 / metres] * 3, rel=1e-4)
     assert facts["clip"] == pytest.approx([0.01, 1000], rel=1e-4)
+
+
+@pytest.mark.parametrize("size", [1e-3, 1.0, 1e4])
+def test_cameras_show_all_of_a_capture_however_small_or_large(bpy_script, tmp_path, size):
+    folder = make_package(tmp_path / "package", 20, cameras=3, points=50)
+    package = json.loads((folder / "package.json").read_text())
+    for camera in package["cameras"]:
+        for row in camera["camera_to_world"][:3]:
+            row[3] *= size
+    (folder / "package.json").write_text(json.dumps(package))
+    for name, key in (("points.npz", "xyz"), ("mesh.npz", "vertices")):
+        arrays = dict(np.load(folder / name))
+        np.savez(folder / name, **{**arrays, key: arrays[key] * np.float32(size)})
+    facts = bpy_script(
+        SETUP
+        + """
+from fieldwork.addon.child.package import _show_colors
+from fieldwork.addon.scene.build import import_package
+from fieldwork.addon.scene.cameras import clip_range
+from fieldwork.addon.scene.package import read_package
+package = read_package(folder)
+imported = import_package(scene, package)
+depths = []
+for camera in imported.cameras:
+    away = [(v.co - camera.location).length for v in imported.mesh.data.vertices]
+    depths.append([camera.data.clip_start, min(away), max(away), camera.data.clip_end])
+camera = imported.cameras[1].data
+camera.clip_end = 77
+import_package(scene, package)
+_show_colors(imported, clip_range(package))
+space = next(s for screen in bpy.data.screens for a in screen.areas for s in a.spaces if s.type == "VIEW_3D")
+answer({"depths": depths, "chosen": camera.clip_end, "view": [space.clip_start, space.clip_end]})
+""",
+        folder=folder,
+    )
+    for depths in [*facts["depths"], [facts["view"][0], *facts["depths"][0][1:3], facts["view"][1]]]:
+        assert depths == sorted(depths)
+    assert facts["chosen"] == 77
+    if size == 1:
+        assert facts["view"] == pytest.approx([0.01, 1000])
 
 
 def test_the_limit_of_a_comparison_is_in_the_units_of_the_scene(bpy_script, tmp_path):

@@ -145,7 +145,7 @@ def evaluate_verdict(
 
 
 def mesh_verdict(
-    hit: float,
+    hit: float | None,
     solid: float | None = None,
     holes: float = 0.0,
     largest: float = 1.0,
@@ -157,14 +157,15 @@ def mesh_verdict(
     """Of `mesh`.
 
     Args:
-        hit: share of the photos' pixels that show it. solid, holes, overlapped, few: shares as `mesh.coverage.Coverage` has
+        hit: share of the photos' pixels that show it; None where a region was asked for, which may be little of what photos
+            show. solid, holes, overlapped, few: shares as `mesh.coverage.Coverage` has
             them.
         largest: share of the area that its largest connected part has. guessed: share of it that closes gaps; None: nobody
             asked for that. denied: share of the area that was left out, as photos disagree on it.
     """
     found = []
     hint = "" if guessed is not None else " Small gaps can be closed by a guess (“close gaps”)."
-    if hit < MISSED or (solid is None and hit < PARTLY):
+    if hit is not None and (hit < MISSED or (solid is None and hit < PARTLY)):
         text = (
             f"The mesh fills {hit:.1%} of the photos: the rest of what they show is missing. Train longer, or enlarge the "
             "region (“photos” takes in all they show)."

@@ -158,8 +158,9 @@ def judge(
     result |= {"overlap_shown": overlapped, "seen_by_few": round(found.few, 4)}
     guessed = guess_share(built)
     asked = 0.0 if params.watertight else guessed if params.close_gaps else None
+    hit = shown if bounds is None else None
     result["verdict"] = mesh_verdict(
-        shown, found.solid, found.holes, largest, found.overlapped, found.few, asked, built.denied
+        hit, found.solid, found.holes, largest, found.overlapped, found.few, asked, built.denied
     )
     result |= {"unseen": round(guessed, 4), "denied": round(built.denied, 4)}
     outlines = silhouette(scene, surface.vertices, surface.faces, report.check)

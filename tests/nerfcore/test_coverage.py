@@ -4,17 +4,26 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import trimesh
+from fieldwork.nerfcore.data.box import Box
 from fieldwork.nerfcore.data.load import load_scene
 from fieldwork.nerfcore.data.scene import Scene
 from fieldwork.nerfcore.geometry.cameras import pixel_centers, rays
 from fieldwork.nerfcore.kernels.raycast import FirstHits
 from fieldwork.nerfcore.mesh import coverage as module
+from fieldwork.nerfcore.mesh.build import Built
 from fieldwork.nerfcore.mesh.coverage import Coverage, coverage, shown_by
 from fieldwork.nerfcore.mesh.depth_maps import DepthMap, FlatView
+from fieldwork.nerfcore.mesh.painted import training_photos
+from fieldwork.nerfcore.mesh.region import Region
+from fieldwork.nerfcore.mesh.surface import Surface
+from fieldwork.nerfcore.mesh.verb import judge
+from fieldwork.nerfcore.params import MeshParams
+from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.verdict import mesh_verdict
 from fieldwork.tests.nerfcore.support.ball import RADIUS, ball_project
 from PIL import Image
@@ -146,6 +155,27 @@ def test_what_fewer_than_three_photos_show_is_told_apart(room: tuple[Path, Scene
     both = mesh_verdict(0.3, 0.7, 0.0, 1.0, 0.8, 0.25)["reasons"][0]
     assert "25% is in fewer than three photos" in both
     assert "train longer" in both
+
+
+def test_what_lies_beside_a_small_region_is_not_missing(room: tuple[Path, Scene]) -> None:
+    """A cap of the ball, in 1 % of the pixels, of which nothing is missing: good where it was asked for, and else a scrap."""
+    folder, scene = room
+    ball = trimesh.creation.icosphere(5, RADIUS)
+    vertices, faces = np.asarray(ball.vertices), np.asarray(ball.faces)[middles()[:, 2] > 0.45]
+    colors, ids = np.zeros((len(vertices), 3), np.uint8), np.zeros(len(vertices), int)
+    region = Region(vertices.min(0), vertices.max(0), 0.01)
+    built = Built(vertices, faces, vertices, colors, region, (vertices, faces))
+    surface = Surface(vertices, faces, vertices, colors, ids, ids[: len(faces)])
+    box, photos = Box(np.eye(4), False), training_photos(scene, np.eye(4))
+    trained = SimpleNamespace(model=None, info=SimpleNamespace(images=[view.name for view in scene.views]))
+    told = {}
+    for asked in ("-1,-1,0.45,1,1,1", "photos"):
+        params = MeshParams(project=folder, region=asked)
+        told[asked] = judge(trained, scene, box, built, surface, photos, params, Reporter())  # pyright: ignore
+    cap, whole = told.values()
+    assert cap["shown"] == whole["shown"] < 0.02
+    assert cap["solid_shown"] > 0.9
+    assert (cap["verdict"]["level"], whole["verdict"]["level"]) == ("good", "failed")
 
 
 def test_a_guess_is_offered_for_what_is_missing_and_told_where_it_is_much() -> None:

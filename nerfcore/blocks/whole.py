@@ -74,7 +74,7 @@ def write_whole(folder: Path, plan: Plan, params: BlocksParams, report: Reporter
         surface.vertices, surface.faces, surface.face_class, names, scene.ignore_id, GAP * voxel
     )
     target, out = folder / "exports" / NAME, params.out
-    earlier = earlier_instances(target, inputs)
+    earlier = earlier_instances(target, inputs, names)
     numbers, instances = with_earlier_joins(numbers, instances, earlier)
     instances = with_earlier_names(instances, earlier)
     surface = replace(surface, face_instance=numbers)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -100,6 +100,20 @@ def with_earlier_names(instances: list[Instance], earlier: list[Instance]) -> li
             name = one.name if one.name not in taken else next(n for n in free if n not in taken)
             taken.add(name)
         found.append(replace(one, name=name))
+    return found
+
+
+def with_class_names(instances: list[Instance], former: Collection[str], names: Mapping[int, str]) -> list[Instance]:
+    """Instances, of which those that are called after a class by a `former` name of it are called after its present one, unless
+    that is taken."""
+    found, taken = [], {one.name for one in instances}
+    for one in instances:
+        old = next((name for name in former if one.name.startswith(f"{name}.")), None)
+        if old is not None and one.class_id in names:
+            new = names[one.class_id] + one.name[len(old) :]
+            one = one if new in taken else replace(one, name=new)
+            taken.add(new)
+        found.append(one)
     return found
 
 

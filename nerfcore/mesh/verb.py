@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -27,7 +28,15 @@ from .build import Built, build, largest_share, wanted_bounds, wanted_sides
 from .coverage import coverage
 from .field_values import shade
 from .formats import check_format
-from .instances import GAP, Instance, find_instances, read_instances, with_earlier_joins, with_earlier_names
+from .instances import (
+    GAP,
+    Instance,
+    find_instances,
+    read_instances,
+    with_class_names,
+    with_earlier_joins,
+    with_earlier_names,
+)
 from .lods import make_levels
 from .outputs import Made, write_outputs
 from .painted import Painted, paint_surface, training_photos
@@ -88,7 +97,7 @@ def mesh(params: MeshParams, report: Reporter) -> dict[str, Any]:
     face_instance, instances = find_instances(
         surface.vertices, surface.faces, surface.face_class, names, scene.ignore_id, GAP * voxel
     )
-    earlier = earlier_instances(target, inputs)
+    earlier = earlier_instances(target, inputs, names)
     face_instance, instances = with_earlier_joins(face_instance, instances, earlier)
     instances = with_earlier_names(instances, earlier)
     surface = replace(surface, face_instance=face_instance)
@@ -124,13 +133,15 @@ def mesh(params: MeshParams, report: Reporter) -> dict[str, Any]:
     return result
 
 
-def earlier_instances(target: Path, inputs: dict[str, str]) -> list[Instance]:
-    """The instances of the mesh that is there, where it lies as the new one will; none where they cannot be read."""
+def earlier_instances(target: Path, inputs: dict[str, str], names: Mapping[int, str]) -> list[Instance]:
+    """The instances of the mesh that is there, where it lies as the new one will, by the present `names` of the classes; none
+    where they cannot be read."""
     made = read_made(target / MESH_RECORD)
     if made is None or made.inputs.get("alignment") != inputs.get("alignment"):
         return []
     try:
-        return read_instances(target)
+        former = set(made.result.get("classes", {})) - set(names.values())
+        return with_class_names(read_instances(target), former, names)
     except ProjectError:  # it is written anew
         return []
 

@@ -64,6 +64,19 @@ def test_names_and_joins_made_by_hand_stay_and_what_was_said_of_the_mesh_before_
     assert not any((target / name).exists() for name in (MEASURES, SCENE_GRAPH))
 
 
+def test_things_are_called_after_a_class_by_its_new_name_unless_they_have_one_of_their_own(
+    asked: tuple[Plan, BlocksParams],
+) -> None:
+    plan, params = asked
+    folder, target = params.project, params.project / "exports" / NAME
+    write_whole(folder, plan, params, Reporter())
+    instances(InstancesParams(project=folder, run=NAME, rename=["upper.001", "dome"]), Reporter())
+    with edit_project(folder) as edited:
+        edited.classes = [one.model_copy(update={"name": f"{one.name} half"}) for one in edited.classes]
+    write_whole(folder, plan, params, Reporter())
+    assert [one.name for one in read_instances(target)] == ["dome", "lower half.001"]
+
+
 class Stops(Reporter):
     """Cancels when a stage begins."""
 

@@ -7,7 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from fieldwork.nerfcore.errors import ProjectError
-from fieldwork.nerfcore.mesh.instances import find_instances, read_instances, write_instances
+from fieldwork.nerfcore.mesh.instances import (
+    Instance,
+    find_instances,
+    read_instances,
+    with_class_names,
+    write_instances,
+)
 from fieldwork.tests.nerfcore.support.flat import box_mesh, wall_mesh
 
 NAMES = {1: "plinth", 2: "vase"}
@@ -51,6 +57,14 @@ def test_a_crack_does_not_part_a_thing_and_crumbs_are_none() -> None:
     assert len(found) == 1
     assert (face_instance == [1] * 2 * len(faces) + [0]).all()
     assert len(find_instances(torn, both, classes, NAMES, 0, 0.01)[1]) == 2
+
+
+def test_new_names_of_classes_do_not_make_two_things_one_name() -> None:
+    called = ("chair.001", "seat.002", "chair.002", "chair.001.2", "chairman", "mine")
+    known = [Instance(n, name, 1, 1.0, (n, 0, 0)) for n, name in enumerate(called, 1)]
+    found = with_class_names(known, {"chair"}, {1: "seat"})
+    assert [one.name for one in found] == ["seat.001", "seat.002", "chair.002", "seat.001.2", "chairman", "mine"]
+    assert with_class_names(known, (), {1: "seat"}) == known
 
 
 def test_nothing_labelled_has_no_instances() -> None:

@@ -17,7 +17,14 @@ from ..images.encode import write_picture
 from ..kernels.closest import ClosestPoints
 from ..mesh.build import not_refuted
 from ..mesh.features import features_of
-from ..mesh.instances import GAP, find_instances, with_earlier_joins, with_earlier_names, write_instances
+from ..mesh.instances import (
+    GAP,
+    find_instances,
+    with_earlier_joins,
+    with_earlier_names,
+    with_earlier_numbers,
+    write_instances,
+)
 from ..mesh.lods import level_files, make_levels, write_level
 from ..mesh.outputs import Places
 from ..mesh.painted import training_photos, unwrapped
@@ -76,7 +83,7 @@ def write_whole(folder: Path, plan: Plan, params: BlocksParams, report: Reporter
     target, out = folder / "exports" / NAME, params.out
     earlier = earlier_instances(target, inputs, names)
     numbers, instances = with_earlier_joins(numbers, instances, earlier)
-    instances = with_earlier_names(instances, earlier)
+    numbers, instances = with_earlier_numbers(numbers, with_earlier_names(instances, earlier), earlier)
     surface = replace(surface, face_instance=numbers)
     painted = None if params.texture is None else paint(common, plan, scene, params.texture, report)
     texture = None if painted is None else texture_of(surface.faces, painted.uv, painted.image)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 from collections.abc import Collection, Mapping
 from dataclasses import asdict, dataclass, replace
@@ -101,6 +102,20 @@ def with_earlier_names(instances: list[Instance], earlier: list[Instance]) -> li
             taken.add(name)
         found.append(replace(one, name=name))
     return found
+
+
+def with_earlier_numbers(
+    face_instance: np.ndarray, instances: list[Instance], earlier: list[Instance]
+) -> tuple[np.ndarray, list[Instance]]:
+    """Instance (F,) of each face and the instances of a mesh that was made again, which have the numbers of the earlier ones of
+    their names: scenes know things by their numbers. Others have numbers that no earlier one had."""
+    known = {old.name: old.id for old in earlier}
+    free = itertools.count(1 + max(known.values(), default=0))
+    found = [replace(one, id=known.get(one.name) or next(free)) for one in instances]
+    number = np.zeros(1 + max((one.id for one in instances), default=0), face_instance.dtype)
+    for one, new in zip(instances, found):
+        number[one.id] = new.id
+    return number[face_instance], found
 
 
 def with_class_names(instances: list[Instance], former: Collection[str], names: Mapping[int, str]) -> list[Instance]:

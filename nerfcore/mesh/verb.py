@@ -36,6 +36,7 @@ from .instances import (
     with_class_names,
     with_earlier_joins,
     with_earlier_names,
+    with_earlier_numbers,
 )
 from .lods import make_levels
 from .outputs import Made, write_outputs
@@ -99,7 +100,7 @@ def mesh(params: MeshParams, report: Reporter) -> dict[str, Any]:
     )
     earlier = earlier_instances(target, inputs, names)
     face_instance, instances = with_earlier_joins(face_instance, instances, earlier)
-    instances = with_earlier_names(instances, earlier)
+    face_instance, instances = with_earlier_numbers(face_instance, with_earlier_names(instances, earlier), earlier)
     surface = replace(surface, face_instance=face_instance)
     levels = make_levels(surface, texture, params.lods, report)
     judged = judge(trained, scene, box, built, surface, photos, params, report)

@@ -64,6 +64,18 @@ def test_names_and_joins_made_by_hand_stay_and_what_was_said_of_the_mesh_before_
     assert not any((target / name).exists() for name in (MEASURES, SCENE_GRAPH))
 
 
+def test_things_keep_their_numbers(asked: tuple[Plan, BlocksParams]) -> None:
+    plan, params = asked
+    target = params.project / "exports" / NAME
+    write_whole(params.project, plan, params, Reporter())
+    upper, lower = read_instances(target)
+    write_instances(target, [replace(lower, id=1), replace(upper, id=2)])  # as where the lower one was larger
+    write_whole(params.project, plan, params, Reporter())
+    assert [(one.id, one.name) for one in read_instances(target)] == [(2, "upper.001"), (1, "lower.001")]
+    with np.load(target / "mesh.npz") as mesh:
+        assert (mesh["face_instance"] == np.where(mesh["face_class"] == 1, 2, 1)).all()
+
+
 def test_things_are_called_after_a_class_by_its_new_name_unless_they_have_one_of_their_own(
     asked: tuple[Plan, BlocksParams],
 ) -> None:

@@ -19,6 +19,7 @@ from fieldwork.nerfcore.mesh.instances import (
     read_instances,
     with_earlier_joins,
     with_earlier_names,
+    with_earlier_numbers,
     write_instances,
 )
 from fieldwork.nerfcore.mesh.stored import MESH, mesh_folder
@@ -253,6 +254,14 @@ def test_a_mesh_that_is_made_again_keeps_the_names_of_its_things() -> None:
     assert [i.name for i in named] == ["vase.002", "Ming", "vase.003", "book.001"]
     assert [i.id for i in named] == [1, 2, 3, 4]
     assert [i.name for i in with_earlier_names(after, [])] == [i.name for i in after]
+    # Objects in Blender are known by the numbers.
+    faces, numbered = with_earlier_numbers(np.array([0, 1, 2, 3, 4, 1], np.uint32), named, before)
+    assert [(i.id, i.name) for i in numbered] == [(2, "vase.002"), (1, "Ming"), (4, "vase.003"), (3, "book.001")]
+    assert faces.tolist() == [0, 2, 1, 4, 3, 2]
+    assert faces.dtype == np.uint32
+    faces, numbered = with_earlier_numbers(np.array([0, 3], np.uint32), after, [])
+    assert (faces.tolist(), numbered) == ([0, 3], after)
+    assert with_earlier_numbers(np.array([0, 0], np.uint32), [], before)[0].tolist() == [0, 0]
 
 
 def test_a_mesh_that_is_made_again_joins_what_was_joined_by_hand(tmp_path: Path) -> None:

@@ -37,24 +37,9 @@ from .verbs import VERBS, run_verb
 # Worker threads that spin while they wait take the cores other programs need; read when OpenMP starts.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
-POSITIONAL = ("project", "dataset", "photos", "list", "out")
-# Verbs in which one of the names above is an option.
-NAMED = {
-    "new": {"photos"},
-    "render": {"out"},
-    "mesh": {"out"},
-    "turntable": {"out"},
-    "plan": {"out"},
-    "section": {"out"},
-    "compare": {"out"},
-    "report": {"out"},
-    "reconstruct": {"out"},
-    "blocks": {"out"},
-    "bench": {"out"},
-    "export": {"out"},
-    "label overlay": {"out"},
-    "label parts": {"out"},
-}
+POSITIONAL = ("project", "dataset", "photos", "list", "out")  # where the verb needs them
+# Verbs in which one that is needed is an option.
+NAMED = {"new": {"photos"}, "render": {"out"}, "reconstruct": {"out"}}
 # What verbs of two words have in common.
 GROUPS = {
     "label": "Label a scene by a few marks on its photos.",
@@ -177,7 +162,8 @@ def _command(name: str) -> click.Command:
     """The click command of a verb."""
     verb = VERBS[name]
     fields = verb.params.model_fields
-    arguments = ORDER.get(name) or [n for n in POSITIONAL if n in fields and n not in NAMED.get(name, set())]
+    named = NAMED.get(name, set())
+    arguments = ORDER.get(name) or [n for n in POSITIONAL if n in fields and fields[n].is_required() and n not in named]
     params: list[click.Parameter] = [click.Argument([n], type=PATH, metavar=n.upper()) for n in arguments]
     left_out = {*arguments, *FILES.get(name, {})}
     params += [_option(n, info) for n, info in fields.items() if n not in left_out]

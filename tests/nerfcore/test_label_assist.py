@@ -324,3 +324,17 @@ def test_the_command_line_cuts_out(tmp_path: Path, project: Path, capfd: pytest.
     assert json.loads(capfd.readouterr().out)["revision"] == 1
     assert main([*words, "--box", "10", "20", "30", "34", "--json"]) == 0
     assert json.loads(capfd.readouterr().out)["pixels"] > 50
+
+
+def test_the_command_line_encodes_and_guesses(tmp_path: Path, project: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    encoder, decoder = tiny.encoder(tmp_path / "e.onnx"), tiny.sam_decoder(tmp_path / "d.onnx")
+    words = ["assist", "embed", str(project), "--encoder", str(encoder), "--decoder", str(decoder), "--json"]
+    assert main([*words, "--photos", "01"]) == 0
+    assert json.loads(capfd.readouterr().out)["photos"] == 1
+    assert main(words) == 0
+    assert json.loads(capfd.readouterr().out)["photos"] == 2, "all photos, where none is named"
+    mapping = tmp_path / "mapping.json"
+    mapping.write_text('{"0": "top"}')
+    model = tiny.segformer(tmp_path / "m.onnx")
+    assert main(["assist", "suggest", str(project), "--model", str(model), "--mapping", str(mapping), "--json"]) == 0
+    assert json.loads(capfd.readouterr().out)["photos"] == 2

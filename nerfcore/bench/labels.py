@@ -17,9 +17,9 @@ from ..labels.preparation import Preparation, ensured
 from ..params import BenchParams, TrainParams
 from ..progress import Reporter
 from ..project.fingerprints import digest
-from ..project.runs import has_checkpoint, read_metrics, run_folder
+from ..project.runs import read_metrics, run_folder
 from ..project.store import edit_project, is_project
-from ..train.verb import train
+from ..train.reuse import finished, train_or_keep, unfinished
 from .label_bounds import best_order, class_overlaps, every_pixel, held_out, seen_before, withheld
 from .label_studies import (
     CURVES,
@@ -36,6 +36,7 @@ from .label_trials import CORRECTIONS, Annotator, Subject, all_labels, read_subj
 from .machine import describe, taken
 from .page import figures_folder, write_page
 from .results import ResultSet, write_set
+from .suites import limits
 from .tables import table
 
 TOOL_CHOOSES = ("replica_room",)  # the photos the annotator begins with; of other scenes those that show most classes
@@ -82,9 +83,11 @@ def labels_suite(
     seeds = params.seeds or SEEDS
     for name, labelled in projects.items():
         bare = without_labels(labelled, out / "projects" / name)
-        if not has_checkpoint(run_folder(bare, "main")):
-            limits = {"steps": params.steps or STEPS, "time_limit": params.seconds}
-            train(TrainParams(project=bare, preset=params.preset, set=params.set, **limits), report)
+        training = TrainParams.model_validate(
+            {"project": bare, "preset": params.preset, "set": params.set, **limits(params, STEPS)}
+        )
+        if finished(training).result is None:
+            train_or_keep(training.model_copy(update={"resume": unfinished(training)}), report)
         ready, _ = ensured(bare, "main", report)
         file, made = out / "runs" / f"{name}.json", digest([ready.inputs, seeds, origin.commit, origin.modified])
         known = read_run(file, made)

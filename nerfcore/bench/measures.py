@@ -21,11 +21,13 @@ from ..measure.verb import measure
 from ..mesh.verb import mesh
 from ..params import BenchParams, MeasureParams, MeshParams, TrainParams
 from ..progress import Reporter
+from ..project.fingerprints import digest
 from ..train.verb import train
 from .machine import describe, taken
 from .page import figures_folder, write_page
 from .results import ResultSet, write_set
 from .still_life import NAMES, SCALE, StillLife, photographed, still_life
+from .suites import limits
 from .tables import table
 
 SEEDS = list(range(20))
@@ -60,8 +62,10 @@ def measures_suite(params: BenchParams, out: Path, command: str, report: Reporte
         {"suite", "machine", "runs", "failed", "rows", "trials", "notes", "files"}
     """
     seeds, origin, trials, failed = params.seeds or SEEDS, taken(), [], 0
+    # Of other settings, and of other code, figures are others.
+    made = digest([limits(params, STEPS), params.set, origin.machine.model_dump(), origin.commit, origin.modified])
     for number, seed in enumerate(seeds):
-        stored = out / "runs" / f"{seed}-{params.steps or STEPS}.json"
+        stored = out / "runs" / f"{seed}-{made[:12]}.json"
         report.progress(number / len(seeds), f"capture {number + 1} of {len(seeds)}")
         if not stored.is_file():
             try:
@@ -103,7 +107,8 @@ def one_trial(seed: int, params: BenchParams, project: Path, report: Reporter) -
     report.stage("Photographing")
     photographed(truth, project, seed)
     settings = {**SMALL, "train.seed": str(seed), **params.set}
-    train(TrainParams(project=project, preset="draft", steps=params.steps or STEPS, set=settings), report)
+    training = {"project": project, "preset": "draft", "set": settings, **limits(params, STEPS)}
+    train(TrainParams.model_validate(training), report)
     mesh(MeshParams(project=project, resolution=CELLS), report)
     found = measure(MeasureParams(project=project, scale_error=100 * SCALE, caps=STANDS), report)
     seconds = time.process_time() - begin

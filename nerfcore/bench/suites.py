@@ -68,6 +68,12 @@ def variants(suite: str) -> dict[str, dict[str, str]]:
     return {"standard": {}}
 
 
+def limits(params: BenchParams, steps: int) -> dict[str, float | int | None]:
+    """Where a training ends: after the seconds or steps that were asked for, else after `steps`, the suite's own."""
+    own = params.seconds is None and params.steps is None
+    return {"steps": steps if own else params.steps, "time_limit": params.seconds}
+
+
 def plan(params: BenchParams, scenes: list[str]) -> list[Job]:
     """The jobs of a suite on some scenes.
 

@@ -5,17 +5,22 @@ from __future__ import annotations
 import json
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 from fieldwork.nerfcore.bench import label_times
+from fieldwork.nerfcore.bench import labels as suite
 from fieldwork.nerfcore.bench.annotator import LONGEST, correction, first_strokes, largest_component, medial_stroke
 from fieldwork.nerfcore.bench.label_bounds import HeldOut, boldest, class_overlaps, held_out, of_pixels, seen_before
 from fieldwork.nerfcore.bench.label_studies import photos_needed, photos_that_show
 from fieldwork.nerfcore.bench.label_trials import Subject, best_pair, calibration_error, labelled, scores
 from fieldwork.nerfcore.bench.labels import row
+from fieldwork.nerfcore.errors import Cancelled
 from fieldwork.nerfcore.params import BenchParams, LabelAcceptParams
 from fieldwork.nerfcore.progress import Reporter
+from fieldwork.nerfcore.project.runs import read_metrics
 from fieldwork.nerfcore.project.store import load_project
 from fieldwork.nerfcore.verbs import run_verb
 from fieldwork.tests.nerfcore.support.ball import SMALL, ball_project
@@ -151,6 +156,37 @@ def test_rows_say_whether_what_is_asked_is_reached() -> None:
     assert row("a", [1.0, 3.0], most=2.0)["reached"] == "no"
     assert row("a", [0.5])["asked"] == "–"
     assert row("a", [None], 0.5)["reached"] is None
+
+
+def test_a_field_of_other_settings_or_that_was_stopped_is_trained_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ball = ball_project(tmp_path / "ball", views=6)
+    prepared = SimpleNamespace(inputs={}, surfels=[])
+    monkeypatch.setattr(suite, "ensured", lambda *_: (prepared, False))
+    monkeypatch.setattr(suite, "scene_figures", lambda *_: {"rows": [], "trials": [], "notes": []})
+    params = BenchParams(suite="labels", out=tmp_path / "out", scenes=[str(ball)], preset="draft", set=SMALL)
+    place = tmp_path / "out" / "labels" / "projects" / "ball" / "runs" / "main"
+
+    def field(report: Reporter | None = None, **values: Any) -> tuple[int, int]:
+        """Steps of the field after the suite, and when it was written."""
+        run_verb("bench", params.model_copy(update=values), report or Reporter())
+        return read_metrics(place)["train"]["steps"], (place / "field.safetensors").stat().st_mtime_ns
+
+    class Stops(Reporter):
+        def stage(self, name: str) -> None:
+            super().stage(name)
+            if name == "Training":
+                self.cancel()
+
+    with pytest.raises(Cancelled):
+        field(Stops(), steps=6)
+    assert (place / "field.safetensors").is_file()
+    trained = field(steps=6)
+    assert trained[0] == 6
+    assert field(steps=6) == trained, "a field that is finished stays"
+    assert field(steps=9)[0] == 9
+    assert field(seconds=1.5)[0] != 800
 
 
 @pytest.mark.slow

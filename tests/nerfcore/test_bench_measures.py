@@ -9,11 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 from fieldwork.nerfcore.bench import measures
+from fieldwork.nerfcore.bench.machine import taken
 from fieldwork.nerfcore.bench.still_life import TABLE, photographed, still_life
 from fieldwork.nerfcore.data.load import load_scene
 from fieldwork.nerfcore.errors import TrainingError
 from fieldwork.nerfcore.mesh.triangles import areas
-from fieldwork.nerfcore.params import BenchParams
+from fieldwork.nerfcore.params import BenchParams, TrainParams
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.verbs import run_verb
 from PIL import Image
@@ -85,6 +86,26 @@ def test_a_suite_goes_on_and_says_what_failed(tmp_path: Path, monkeypatch: pytes
     assert json.loads(Path(result["files"][0]).read_text())["rows"] == result["rows"]
     run_verb("bench", params, Reporter())
     assert asked == [1, 2, 2]
+    for other in ({"seconds": 3.0}, {"set": {"loss.huber_delta": "0.2"}}, {"steps": 100}):
+        run_verb("bench", params.model_copy(update={"seeds": [1], **other}), Reporter())
+    assert asked == [1, 2, 2, 1, 1, 1], "of other settings figures are others"
+    monkeypatch.setattr(measures, "taken", lambda: taken().model_copy(update={"commit": "another"}))
+    run_verb("bench", params.model_copy(update={"seeds": [1]}), Reporter())
+    assert asked[6:] == [1], "and of other code"
+
+
+def test_a_capture_is_trained_for_as_long_as_was_asked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Trained(Exception): ...
+
+    def train(params: TrainParams, report: Reporter) -> None:
+        raise Trained((params.steps, params.time_limit))
+
+    monkeypatch.setattr(measures, "photographed", lambda *_: None)
+    monkeypatch.setattr(measures, "train", train)
+    for asked, told in (({}, (200, None)), ({"seconds": 9.0}, (None, 9.0)), ({"steps": 30}, (30, None))):
+        with pytest.raises(Trained) as found:
+            measures.one_trial(0, BenchParams(suite="measures", **asked), tmp_path / "p", Reporter())
+        assert found.value.args == (told,)
 
 
 @pytest.mark.slow

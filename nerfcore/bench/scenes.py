@@ -40,10 +40,16 @@ def prepare(scene: str, data: Path | None, out: Path, report: Reporter) -> Path:
     copied.
 
     Raises:
-        InputError: there is no such scene. BlenderError: simulating needs the `bpy` package and it is missing.
+        InputError: there is no such scene, or `out` has another project of its name. BlenderError: simulating needs the
+        `bpy` package and it is missing.
     """
     project = out / "projects" / scene_name(scene)
     if is_project(project):
+        if is_project(Path(scene)) and load_project(Path(scene)).uuid != load_project(project).uuid:
+            raise InputError(
+                f"{project} is a scene of the same name, but not a copy of {scene}.",
+                "Choose another folder with --out, or rename the project's folder.",
+            )
         return project
     half_made = project.with_name(f".{project.name}")
     shutil.rmtree(half_made, ignore_errors=True)

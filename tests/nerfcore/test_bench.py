@@ -19,11 +19,12 @@ from fieldwork.nerfcore.bench.jobs import Job, interrupted
 from fieldwork.nerfcore.bench.machine import run_yardstick
 from fieldwork.nerfcore.bench.page import figures_folder
 from fieldwork.nerfcore.bench.results import read_sets
+from fieldwork.nerfcore.bench.scenes import prepare
 from fieldwork.nerfcore.errors import Cancelled, InputError, SettingError, TrainingError
 from fieldwork.nerfcore.params import BenchParams, TrainParams
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.verbs import run_verb
-from fieldwork.tests.nerfcore.support.ball import SMALL
+from fieldwork.tests.nerfcore.support.ball import SMALL, ball_project
 from fieldwork.tests.nerfcore.test_training import tiny_project  # noqa: F401
 from PIL import Image
 
@@ -237,6 +238,14 @@ def test_two_scenes_of_one_name_are_refused(tiny_project: Path, tmp_path: Path) 
     params = BenchParams(suite="speed", out=tmp_path, scenes=[str(tiny_project), str(tiny_project)])
     with pytest.raises(InputError, match="Two scenes are called"):
         run_verb("bench", params, Reporter())
+
+
+def test_another_project_of_the_name_of_a_scene_is_not_taken_for_it(tmp_path: Path) -> None:
+    first, other = (ball_project(tmp_path / folder / "vase", views=3, side=8) for folder in "ab")
+    copied = prepare(str(first), None, tmp_path / "out", Reporter())
+    assert prepare(str(first), None, tmp_path / "out", Reporter()) == copied
+    with pytest.raises(InputError, match="not a copy of"):
+        prepare(str(other), None, tmp_path / "out", Reporter())
 
 
 def test_a_run_that_fails_does_not_stop_the_others(

@@ -80,6 +80,12 @@ class RenderParams(Params):
     )
 
     @model_validator(mode="after")
+    def _cameras_of_one_kind(self) -> Self:
+        if self.test + self.all + (self.camera is not None) + (self.orbit is not None) > 1:
+            raise ValueError("give one of test, all, camera and orbit")
+        return self
+
+    @model_validator(mode="after")
     def _range_goes_up(self) -> Self:
         if self.frame_range is not None and not 0 <= self.frame_range[0] <= self.frame_range[1]:
             raise ValueError(f"frame_range: {self.frame_range[0]} to {self.frame_range[1]} is no range of frames")

@@ -148,3 +148,10 @@ def test_bad_files_among_good_ones_are_a_warning(tmp_path: Path, capfd: pytest.C
     assert (code, answer["images"]) == (3, 5)
     assert answer["rejected"] == [{"file": "a.jpg", "reason": "the file is empty (0 bytes)"}]
     assert command(capfd, "new", tmp_path / "p", "--photos", photos)[0] == 0
+
+
+def test_what_excludes_each_other_is_refused(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    for cameras in (["--test", "--orbit", 4], ["--all", "--camera", "cameras.json"], ["--test", "--all"]):
+        code, answer = command(capfd, "render", tmp_path, "--out", tmp_path / "r", *cameras)
+        assert (code, answer["error"]["code"]) == (2, "usage")
+        assert "give one of test, all, camera and orbit" in answer["error"]["message"]

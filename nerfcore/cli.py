@@ -139,7 +139,8 @@ def _option(name: str, info: FieldInfo) -> click.Option:
     if get_origin(kind) is dict:
         return click.Option(flags, multiple=True, metavar="KEY=VALUE", **shared)
     if get_origin(kind) is tuple and get_args(kind) == (int, int) and name == "size":
-        return click.Option(flags, type=Size(), default=default, show_default=default is not None, **shared)
+        written = None if default is None else "x".join(map(str, default))
+        return click.Option(flags, type=Size(), default=written, show_default=True, **shared)
     if get_origin(kind) is tuple:
         each = tuple(get_args(kind))
         names = " ".join(click.types.convert_type(t).name.upper() for t in each)

@@ -155,3 +155,8 @@ def test_what_excludes_each_other_is_refused(tmp_path: Path, capfd: pytest.Captu
         code, answer = command(capfd, "render", tmp_path, "--out", tmp_path / "r", *cameras)
         assert (code, answer["error"]["code"]) == (2, "usage")
         assert "give one of test, all, camera and orbit" in answer["error"]["message"]
+
+
+def test_defaults_are_shown_as_they_are_written(capfd: pytest.CaptureFixture[str]) -> None:
+    assert main(["simulate", "--help"]) == 0
+    assert "[default: 480x320]" in " ".join(capfd.readouterr().out.split())

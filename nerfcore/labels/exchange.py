@@ -293,8 +293,9 @@ def check_out(params: LabelExportParams, project: Project, out: Path) -> None:
         raise InputError(f"{out} is there already.", "Give a new folder, or an empty one.")
     names = [c.name for c in project.classes]
     if params.format == "masks" and params.class_name not in names:
+        wrong = f"There is no class “{params.class_name}”" if params.class_name else "Masks are of one class"
         raise SettingError(
-            f"There is no class “{params.class_name}”.", f"The classes are {', '.join(names) or 'none'}."
+            f"{wrong}: say which one is white, with --class-name.", f"The classes are {', '.join(names) or 'none'}."
         )
 
 

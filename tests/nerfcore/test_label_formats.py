@@ -551,6 +551,8 @@ def test_folders_and_files_that_are_wrong_are_refused(tmp_path: Path) -> None:
         export(folder, tmp_path / "x.json", "cvat")
     with pytest.raises(SettingError, match="no class"):
         export(folder, tmp_path / "m", "masks", class_name="gold")
+    with pytest.raises(SettingError, match=r"say which one is white, with --class-name\. The classes are \w"):
+        export(folder, tmp_path / "m", "masks")
     (tmp_path / "full").mkdir()
     (tmp_path / "full/x").touch()
     with pytest.raises(InputError, match="there already"):

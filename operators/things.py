@@ -115,12 +115,14 @@ def show_instances(job: Job) -> None:
     refresh_scenes(job)
     if job.state != "done" or not job.result or job.project is None:
         return
-    from ..addon.scene import things as objects  # not at the top: enabling the extension must be quick
+    # Not at the top: enabling the extension must be quick.
+    from ..addon.scene import things as objects
+    from ..addon.scene.owned import call
 
     own = objects.objects(snapshot.owner(job.project))
     for entry in job.result["instances"]:
         if entry["id"] in own and entry["name"] in job.result["changed"]:
-            own[entry["id"]].name = entry["name"]
+            call(own[entry["id"]], entry["name"])
     if job.params.get("rename"):
         rename_in_fields(job.project, str(job.params.get("run", "main")), *job.params["rename"])
     if own and (job.params.get("merge") or job.params.get("split")):

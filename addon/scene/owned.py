@@ -18,6 +18,8 @@ from .own_look import give_own_look
 from .slices import Held
 
 VOLUME = "volume"  # role of what volume.py shows
+# Custom properties of objects: what they were called, and the group they were put in, which follow new names of classes.
+NAME, GROUP = "fieldwork_name", "fieldwork_group"
 
 
 class Owned:
@@ -71,11 +73,17 @@ class Owned:
         return made
 
     def object(self, role: str, name: str, data: Any, group: str = "") -> bpy.types.Object:
-        """The object of a role, with `data` if it is new; `group`: the collection it stands in then, of this name."""
+        """The object of a role, with `data` if it is new; `group`: the collection it stands in then, of this name. One that the
+        user has not renamed is called by this name."""
         self.used.add(role)
         item = self.known.get(role)
+        if item is not None and item.get(NAME) == item.name:
+            call(item, name)
+        if item is not None and item.get(GROUP, group) != group:
+            self._rename_group(item[GROUP], group)
         if item is None:
             item = bpy.data.objects.new(name, data)
+            call(item, name)
             self._place(role, group).objects.link(item)
             self.known[role] = item
             if role == "root":  # also of what is left from one that was deleted
@@ -85,7 +93,17 @@ class Owned:
             else:
                 item.parent = self.existing("root")
         self.owner.mark(item, role)
+        if group:
+            item[GROUP] = group
         return item
+
+    def _rename_group(self, old: str, new: str) -> None:
+        """Let the collection of a class have its new name, unless there is one of this name."""
+        groups = {child.get(ROLE): child for child in self.collection.children if self.owner.owns(child)}
+        found = groups.get(f"group:{old}")
+        if found is not None and f"group:{new}" not in groups:
+            found.name = new if found.name == old else found.name
+            self.owner.mark(found, f"group:{new}")
 
     def _place(self, role: str, group: str) -> bpy.types.Collection:
         if role.startswith("camera"):
@@ -134,12 +152,13 @@ class Owned:
         if (yield from self._changed(role, replaced=True)):
             self.leave(role)
         before = self.existing(role)
+        called = before.name if before is not None else ""
         item = self.object(role, name, held(), group)
         if before is not None:
             old, kept = before.data, before.data.name
             old.user_remap(held())
             bpy.data.meshes.remove(old)
-            held().name = kept
+            held().name = item.name if kept == called else kept
         return item
 
     def remove_unused(self) -> Steps:
@@ -155,6 +174,12 @@ class Owned:
         for child in list(self.collection.children):
             if str(child.get(ROLE, "")).startswith("group:") and not child.all_objects and not child.children:
                 bpy.data.collections.remove(child)
+
+
+def call(item: bpy.types.Object, name: str) -> None:
+    """Give an object a name, which it has until the user gives it another one."""
+    item.name = name
+    item[NAME] = item.name
 
 
 def find(items: Any, owner: Owner, role: str, name: str, fits: Callable[[Any], bool] = lambda item: True) -> Any:

@@ -51,6 +51,36 @@ answer([again.warnings, names() == before, len(bpy.data.images) - images, len(bp
     assert facts == [[], True, 0, 3]  # surface, points, and the default cube
 
 
+def test_a_class_that_is_renamed_is_called_so_in_the_scene_but_for_what_the_user_called_otherwise(bpy_script, package):
+    facts = bpy_script(
+        IMPORT
+        + """
+import json
+def outliner(split):
+    made = update(split)
+    return sorted([o.name, o.data.name, o.users_collection[0].name] for o in made.meshes)
+def rename(*names):
+    value = json.loads((Path(package) / "package.json").read_text())
+    for entry, name in zip(value["classes"], names):
+        entry["name"] = name
+    (Path(package) / "package.json").write_text(json.dumps(value))
+rename("class 1", "class 2")
+seen = [outliner("classes")]
+bpy.data.objects["class 2"].name = "crown"
+bpy.data.collections["class 2"].name = "jewels"
+rename("stone", "gold")
+seen += [outliner("classes")]
+rename("gold", "stone")
+seen += [outliner("classes")]
+answer(seen)
+""",
+        package=package,
+    )
+    assert facts[0] == [["class 1"] * 3, ["class 2"] * 3]
+    assert facts[1] == [["crown", "class 2", "jewels"], ["stone"] * 3]
+    assert [names[:2] for names in facts[2]] == [["crown", "class 2"], ["gold", "gold"]]
+
+
 def test_settings_that_the_user_chose_are_not_reset(bpy_script, package):
     facts = bpy_script(
         IMPORT

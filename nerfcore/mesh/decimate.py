@@ -16,6 +16,7 @@ WHOLE = 1_000_000  # faces simplified as one piece, so that open borders can mov
 PASSES = 12
 STALLED = 0.98  # share of its faces that a pass leaves, from which on the next ones are in vain
 STEP = 2.0**-20  # of a mesh's size: what is nearer than that would be one vertex in a file of single precision
+SIZE = 10_000.0  # of a mesh's longest side while it is simplified, about: fast-simplification's limits of error are of no unit
 AT_ONCE = 0.25  # share of a chunk's faces that at least remain in one pass: its border is kept as it is until the next
 
 
@@ -56,8 +57,12 @@ def _passes(
     size: int,
     report: Reporter,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    total = max(len(faces) - target, 1)
-    step = STEP * float(np.ptp(vertices, axis=0).max()) if len(faces) > target else 1.0
+    if len(faces) <= target:
+        return vertices, faces, patch
+    total = len(faces) - target
+    scale = enlargement(vertices)
+    vertices = vertices * scale
+    step = STEP * float(np.ptp(vertices, axis=0).max())
     for number in range(PASSES):
         before = len(faces)
         if before <= target:
@@ -74,7 +79,14 @@ def _passes(
     if move_borders and target < len(faces) <= WHOLE:  # nothing but borders is left
         ratio = target / len(faces)
         vertices, faces, patch = _one_pass(vertices, faces, patch, ratio, 0, WHOLE, False, False, step, report)
-    return vertices, faces, patch
+    return vertices / scale, faces, patch
+
+
+def enlargement(vertices: np.ndarray) -> float:
+    """How many times larger a mesh with vertices (V, 3) is simplified, see `SIZE`: a power of two, so that borders come back to
+    their place to the bit."""
+    extent = float(np.ptp(vertices, axis=0).max())
+    return float(2.0 ** np.round(np.log2(SIZE / extent))) if extent > 0 else 1.0
 
 
 def _one_pass(

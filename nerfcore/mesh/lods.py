@@ -24,7 +24,6 @@ from .uv import unwrap
 
 FEWER = 4  # times fewer triangles in each level: half as many along each way
 SMALLEST = 256  # texels along a side of a texture
-SIZE = 10_000.0  # of a mesh's longest side while it is simplified: fast-simplification's limits of error are of no unit
 SAMPLES = 20_000  # points that the distance between two levels is measured at
 
 
@@ -51,13 +50,15 @@ def make_levels(surface: Surface, texture: Texture | None, count: int, report: R
     samples, _ = sample_surface(surface.vertices.astype(np.float64), surface.faces, SAMPLES)
     labels = np.stack([surface.face_class, _instances(surface)], 1)
     rows, patch = np.unique(labels, axis=0, return_inverse=True)
-    middle, scale = _frame(surface.vertices)
-    vertices, faces, patch = (surface.vertices - middle) * scale, surface.faces.astype(np.int64), patch.reshape(-1)
+    middle = (
+        surface.vertices.min(0).astype(np.float64) + surface.vertices.max(0)
+    ) / 2  # the world's origin may be far off
+    vertices, faces, patch = surface.vertices - middle, surface.faces.astype(np.int64), patch.reshape(-1)
     levels = []
     for number in range(1, count + 1):
         report.stage(f"Simplifying, level {number}")
         vertices, faces, patch = decimate_patches(vertices, faces, patch, len(surface.faces) // FEWER**number, report)
-        made = _dressed(surface, closest, vertices / scale + middle, faces, rows[patch])
+        made = _dressed(surface, closest, vertices + middle, faces, rows[patch])
         deviation = float(np.quantile(ClosestPoints(made.vertices, faces).find(samples)[2], 0.95))
         uv = picture = None
         if texture is not None:
@@ -86,12 +87,6 @@ def write_level(folder: Path, number: int, level: Level, check: Callable[[], Non
 def level_files(folder: Path) -> list[Path]:
     """The files of the levels of the mesh in a folder."""
     return [*folder.glob("mesh_lod*"), *folder.glob("texture_lod*.png")]
-
-
-def _frame(vertices: np.ndarray) -> tuple[np.ndarray, float]:
-    """Middle (3,) of a mesh's vertices (V, 3), and how many times larger it is to be simplified; see `SIZE`."""
-    low, high = vertices.min(0).astype(np.float64), vertices.max(0).astype(np.float64)
-    return (low + high) / 2, SIZE / float((high - low).max())
 
 
 def _instances(surface: Surface) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,8 +12,9 @@ import trimesh
 from fieldwork.nerfcore.errors import Cancelled
 from fieldwork.nerfcore.kernels.closest import ClosestPoints
 from fieldwork.nerfcore.mesh import decimate as decimation
-from fieldwork.nerfcore.mesh.decimate import decimate_patches
+from fieldwork.nerfcore.mesh.decimate import decimate, decimate_closed, decimate_patches
 from fieldwork.nerfcore.mesh.lods import level_files, make_levels, write_level
+from fieldwork.nerfcore.mesh.metrics import sample_surface
 from fieldwork.nerfcore.mesh.parts import texture_of
 from fieldwork.nerfcore.mesh.surface import Surface, is_watertight
 from fieldwork.nerfcore.mesh.triangles import border_edges
@@ -53,6 +55,20 @@ def test_levels_are_as_near_whatever_the_unit(unit: float) -> None:
         assert level.deviation == pytest.approx(plain.deviation * unit, rel=0.1)
 
 
+@pytest.mark.parametrize("simplify", [decimate, decimate_closed])
+def test_a_small_region_is_simplified_as_well_as_a_large_one(simplify: Callable) -> None:
+    """As of a thing in a room, or of a block of a large capture."""
+    round_ball = trimesh.creation.icosphere(4)
+    places = np.asarray(round_ball.vertices)
+    bumpy = places * (1 + 0.15 * np.sin(7 * places).prod(1))[:, None]
+    points, far = sample_surface(bumpy, round_ball.faces, 5000)[0], []
+    for size in (1.0, 0.01):
+        vertices, faces = simplify(bumpy * size, np.asarray(round_ball.faces), 600, Reporter())
+        assert len(faces) <= 660
+        far.append(np.quantile(ClosestPoints(vertices / size, faces).find(points)[2], 0.95))
+    assert far[1] == pytest.approx(far[0], rel=0.2)
+
+
 def test_levels_keep_class_borders_and_stay_closed_and_near() -> None:
     full = ball()
     levels = make_levels(full, None, 2, Reporter())
@@ -90,12 +106,12 @@ def test_chunks_leave_no_cracks(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_collapses_that_fold_an_edge_are_taken_back(monkeypatch: pytest.MonkeyPatch) -> None:
     full = ball()
-    upper = full.face_class == 1
+    upper, scale = full.face_class == 1, decimation.enlargement(full.vertices)
     real = decimation.fast_simplification.simplify
 
     def folding(points: np.ndarray, triangles: np.ndarray, **how):
         points, triangles, *_ = real(points, triangles, **how)
-        if points[:, 2].max() > 15:  # the patch at the top gets a fin
+        if points[:, 2].max() > 15 * scale:  # the patch at the top gets a fin
             fin = [*triangles[0, :2], len(points)]
             points, triangles = np.vstack([points, points[0] + 1]), np.vstack([triangles, fin])
         return points, triangles

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import lru_cache, partial
 
 import numpy as np
 import scipy
@@ -46,6 +46,7 @@ AGREE, AGREE_PIXELS, ROUND_TRIP = (
 OUTSIDE = -1.0  # depth of pixels beside the photo, which can confirm nothing
 HIDDEN = 0.03  # share of a place's distance by which what hides it is nearer
 SMALLEST_FACE = 0.05  # share of a cube's face that a photo must show
+FLAT, ASKED = ("PINHOLE", "OPENCV"), 96  # lenses of one flat picture; longest side at which others are asked for theirs
 
 
 @dataclass(frozen=True)
@@ -90,9 +91,18 @@ def spread_views(views: list[View], most: int) -> list[View]:
 def map_size(views: list[View], device: torch.device) -> int:
     """Longest side of the depth maps, so that all together stay affordable."""
     most = CPU_PIXELS if device.type == "cpu" else GPU_PIXELS
-    sizes = [training_size(view.camera, SIDE) for view in views]
-    total = sum(width * height for width, height in sizes)
+    total = sum(_flat_pixels(view.camera.resized(*training_size(view.camera, SIDE))) for view in views)
     return max(64, int(SIDE * min(1.0, (most / total) ** 0.5)))
+
+
+@lru_cache(maxsize=256)
+def _flat_pixels(camera: Camera) -> float:
+    """Pixels of the flat pictures that show what a camera does, as small ones tell."""
+    if camera.model in FLAT:
+        return camera.width * camera.height
+    small = camera.resized(*training_size(camera, ASKED))
+    share = camera.pixels_per_radian / small.pixels_per_radian
+    return share**2 * sum(face.inside.size for face in _faces(small, np.eye(4), 0))
 
 
 def flat_views(views: list[View], box_from_world: np.ndarray, longest: int) -> list[FlatView]:
@@ -100,11 +110,26 @@ def flat_views(views: list[View], box_from_world: np.ndarray, longest: int) -> l
     made = []
     for index, (view, pose) in enumerate(zip(views, box_poses(views, box_from_world))):
         small = view.camera.resized(*training_size(view.camera, longest))
-        if view.camera.model in ("PINHOLE", "OPENCV"):
+        if view.camera.model in FLAT:
             made.append(_flat(small, small.undistorted(), pose, np.eye(3), index))
-            continue
-        made += [_flat(small, face, pose, turn, index) for face, turn in cube_faces(small)]
+        else:
+            made += _faces(small, pose, index)
     return [view for view in made if view.inside.mean() >= SMALLEST_FACE]
+
+
+def _faces(camera: Camera, pose: np.ndarray, index: int) -> list[FlatView]:
+    """Of the faces of a cube around a wide camera those that show enough of its photo, cut to what they show of it."""
+    faces = [_flat(camera, face, pose, turn, index) for face, turn in cube_faces(camera)]
+    return [_cut(face) for face in faces if face.inside.mean() >= SMALLEST_FACE]
+
+
+def _cut(view: FlatView) -> FlatView:
+    """The part of a picture that holds all of the photo in it."""
+    (top, bottom), (left, right) = (np.flatnonzero(view.inside.any(axis))[[0, -1]] for axis in (1, 0))
+    inside, camera = view.inside[top : bottom + 1, left : right + 1], view.camera
+    size = {"width": inside.shape[1], "height": inside.shape[0]}
+    moved = camera.model_copy(update={**size, "cx": camera.cx - left, "cy": camera.cy - top})
+    return replace(view, camera=moved, inside=inside)
 
 
 def cube_faces(camera: Camera) -> list[tuple[Camera, np.ndarray]]:

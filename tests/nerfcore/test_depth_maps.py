@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -319,3 +320,20 @@ def test_slopes_are_relied_on_where_photos_confirm_or_the_field_is_sharp() -> No
     found = refine.relied_on(flats, soft, sure).reshape(2, *maps[0].depth.shape)
     assert torch.equal(found[0] > 0, torch.from_numpy(sure[0]))
     assert not found[1].any()
+
+
+@pytest.mark.parametrize("focal", [180.0, 260.0, 400.0])
+def test_maps_of_wide_lenses_have_as_many_pixels_as_those_of_others(
+    focal: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What is planned is the size of the pictures that the photos are cut into."""
+    monkeypatch.setattr(depth_maps, "CPU_PIXELS", 4e5)
+    place = {"width": 640, "height": 480, "fx": focal, "fy": focal, "cx": 320, "cy": 240}
+    wide = Camera(model="OPENCV_FISHEYE", distortion=(0.0, 0.0, 0.0, 0.0), **place)
+    views = [View(f"{i:02d}", wide, np.eye(4), Path("none")) for i in range(4)]
+    flats = depth_maps.flat_views(views, np.eye(4), depth_maps.map_size(views, CPU))
+    assert 0.9 < sum(flat.inside.size for flat in flats) / depth_maps.CPU_PIXELS < 1.1
+    for flat in flats:
+        assert flat.inside.shape == (flat.camera.height, flat.camera.width)
+        for side in (flat.inside[0], flat.inside[-1], flat.inside[:, 0], flat.inside[:, -1]):
+            assert side.any(), "nothing is rendered beside the photo"

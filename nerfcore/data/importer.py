@@ -184,7 +184,7 @@ def _read(name: str, source: Path) -> Dataset:
     """Read a data set of this format. Raises InputError, also where its files hold what no reader looks for."""
     try:
         return _reader(name).read(source)
-    except (ValueError, TypeError, LookupError, ArithmeticError) as error:
+    except (AttributeError, ValueError, TypeError, LookupError, ArithmeticError) as error:
         reason = wrong_value(error.errors()[0]) if isinstance(error, ValidationError) else repr(error)
         raise InputError(f"{source} is a damaged data set ({name}): {reason}.", "Export the data set again.") from error
 

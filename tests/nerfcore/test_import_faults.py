@@ -234,6 +234,13 @@ def test_photos_of_a_meshroom_rig_stand_where_its_cameras_do(tmp_path: Path, sai
         np.testing.assert_allclose(found[name][:3, 3], center, atol=1e-12)
 
 
+def test_a_meshroom_file_with_numbers_for_photos_is_damaged(tmp_path: Path) -> None:
+    value = {"views": [{"viewId": "1"}, 3], "intrinsics": [], "poses": []}
+    (tmp_path / "cameras.sfm").write_text(json.dumps(value))
+    with pytest.raises(InputError, match="is a damaged data set"):
+        read_dataset(tmp_path)
+
+
 XMP = """<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:Description xcr:PrincipalPointU="{u}" xcr:AspectRatio="1"
 xcr:FocalLength35mm="35"><xcr:Rotation>1 0 0 0 1 0 0 0 1</xcr:Rotation><xcr:Position>0 0 0</xcr:Position>
 </rdf:Description></x:xmpmeta>"""

@@ -500,6 +500,9 @@ BROKEN = {
             "imageHeight": 5,
         }
     ).encode(),
+    "list of numbers.json": json.dumps([{"data": {"image": "a.jpg"}, "annotations": 3}]).encode(),
+    "samples of none.json": b'{"dataset": {"samples": null, "task_attributes": {"categories": []}}}',
+    "endless.xml": b"<annotations><image name='a' width='7' height='5'><mask label='x' rle='4' left='0' top='0' width='inf' height='2'/></image></annotations>",
     "release.json": b'{"dataset": {"samples": [], "task_attributes": {}}}',
     "a.png": b"no picture",
 }

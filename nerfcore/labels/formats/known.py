@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import zipfile
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from ...errors import InputError
@@ -74,11 +75,29 @@ def _kind_of_json(value: object) -> str | None:
 
 def read(path: Path, kind: str, classes: list[LabelClass], void: int, class_name: str) -> Source:
     """The labels at a path. Raises InputError, also while the pictures are read."""
-    if kind == "png":
-        return masks.read_maps(path, classes, void)
-    if kind == "masks":
-        return masks.read_masks(path, class_name)
-    return READERS[kind](path)
+    with _damage_told(path, kind):
+        if kind == "png":
+            source = masks.read_maps(path, classes, void)
+        elif kind == "masks":
+            source = masks.read_masks(path, class_name)
+        else:
+            source = READERS[kind](path)
+    source.pictures = _pictures(source.pictures, path, kind)
+    return source
+
+
+def _pictures(pictures: Iterator[Picture], path: Path, kind: str) -> Iterator[Picture]:
+    with _damage_told(path, kind):
+        yield from pictures
+
+
+@contextmanager
+def _damage_told(path: Path, kind: str) -> Iterator[None]:
+    """Turn what a reader trips over, where a file holds something else than the tool writes, into an InputError."""
+    try:
+        yield
+    except (AttributeError, TypeError, ValueError, LookupError, ArithmeticError, MemoryError) as error:
+        raise InputError(f"{path} is damaged ({kind}): {error!r}.", "Export the labels once more.") from error
 
 
 def write(

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from ..engine.link import DONE, Link
 
 UNREAD = "The scene cannot be read"
+LAST_WORDS = 2.0  # seconds until what a dead engine said last has been read
 KEPT = 8  # finished jobs the panel remembers
 
 
@@ -268,7 +269,9 @@ class Queue:
 
     def _engine(self) -> Link:
         if self.link is not None and not self.link.alive:
-            self.link.pump()
+            # It may have died this moment: whoever waits for it is told before another one takes its place.
+            while self.link.process is not None and self.link.pump(LAST_WORDS):
+                continue
             if not self.link.alive:
                 self.link = None
         if self.link is None:

@@ -13,6 +13,7 @@ import pytest
 bpy = pytest.importorskip("bpy")
 
 from fieldwork.addon import machine  # noqa: E402
+from fieldwork.addon.engine import link  # noqa: E402
 from fieldwork.addon.engine.link import Link  # noqa: E402
 from fieldwork.addon.errors import EngineError, SceneError  # noqa: E402
 from fieldwork.addon.jobs import (  # noqa: E402
@@ -100,6 +101,29 @@ def test_jobs_run_one_after_the_other(queue, project):
     assert [step for step, _, _ in first.curve] == [0, 10]
     assert queue.current is None
     assert queue.last is second
+
+
+def test_a_job_ends_with_its_engine_though_another_is_asked_at_once(queue, project, monkeypatch):
+    read = link._read
+
+    class Late:
+        def __init__(self, messages):
+            self.messages = messages
+
+        def put(self, message):
+            if message is None:
+                time.sleep(0.3)  # a thread that is not run at once
+            self.messages.put(message)
+
+    monkeypatch.setattr(link, "_read", lambda stream, messages: read(stream, Late(messages)))
+    job = count(queue, project, steps=100_000)
+    queue.submit(job)
+    tick_until(queue, lambda: job.curve)
+    queue.link.process.kill()
+    queue.link.process.wait()
+    queue.ask("ping", {})
+    assert (job.state, job.error.kind) == ("failed", "died")
+    assert queue.running is None
 
 
 def test_neither_starting_nor_watching_a_job_blocks(queue, project):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 
 from .. import machine
@@ -18,10 +19,13 @@ def recent() -> list[Path]:
 
 
 def remember(folder: Path) -> None:
-    """Put a project at the head of the list."""
-    from ...nerfcore.files import write_json  # not at the top: enabling the extension must be quick
+    """Put a project at the head of the list, where the disk takes it."""
+    # Not at the top: enabling the extension must be quick.
+    from ...nerfcore.errors import DiskError
+    from ...nerfcore.files import write_json
 
     path = machine.user_folder() / FILE
     known = read_json(path)
     others = [name for name in known if name != str(folder)] if isinstance(known, list) else []
-    write_json(path, [str(folder), *others][:MOST])
+    with suppress(DiskError):
+        write_json(path, [str(folder), *others][:MOST])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -74,8 +75,11 @@ def time_estimate(folder: Path | None, settings: Any) -> float | None:
 
 
 def remember_time(preset: str, seconds: float) -> None:
-    """Note how long a whole training with a preset took on this machine."""
-    from ...nerfcore.files import write_json  # not at the top: enabling the extension must be quick
+    """Note how long a whole training with a preset took on this machine, where the disk takes it."""
+    # Not at the top: enabling the extension must be quick.
+    from ...nerfcore.errors import DiskError
+    from ...nerfcore.files import write_json
 
     path = machine.user_folder() / TIMES_FILE
-    write_json(path, {**(read_json(path) or {}), preset: seconds})
+    with suppress(DiskError):
+        write_json(path, {**(read_json(path) or {}), preset: seconds})

@@ -29,6 +29,8 @@ from fieldwork.addon.jobs.timer import tick  # noqa: E402
 from fieldwork.addon.project import (  # noqa: E402
     classes,
     edits,
+    recent,
+    runs,
     snapshot,
 )
 from fieldwork.nerfcore.engine import status as st  # noqa: E402
@@ -250,13 +252,18 @@ def test_an_edit_of_the_last_moment_is_taken_after_blender_is_gone(queue, tmp_pa
     assert snapshot.project(project)["classes"][0]["priority"] == 4.0
 
 
-def test_what_the_doctor_found_needs_no_room_on_the_disk(settings, tmp_path):
+def test_what_is_known_of_this_machine_needs_no_room_on_the_disk(settings, tmp_path, project):
     computer.remember({"device": "cpu"})
     assert computer.known() == {"device": "cpu"}
+    recent.remember(project)
+    assert recent.recent() == [project]
+    (tmp_path / "user" / recent.FILE).unlink()
     (tmp_path / "user" / computer.FILE).unlink()
     (tmp_path / "user").rmdir()
     (tmp_path / "user").touch()  # no file can be written in it
     computer.remember({"device": "cpu"})
+    recent.remember(project)
+    runs.remember_time("draft", 1.0)
 
 
 def test_idle_engine_is_released(queue, settings, project):

@@ -49,12 +49,16 @@ class Options:
 
 
 def remove(folder: Path) -> None:
-    """Remove the engine and its downloads. Raises InstallError while another Blender installs it."""
+    """Remove the engine and its downloads. Raises InstallError while another Blender installs it, or runs it on Windows."""
     with only_one(folder):
         for name in (COMPLETE, STAGING):
             (folder / name).unlink(missing_ok=True)
-        for name in (*ENVIRONMENTS, "tools", "cache"):
-            shutil.rmtree(folder / name, ignore_errors=True)
+        places = [folder / name for name in (*ENVIRONMENTS, "tools", "cache")]
+        for place in places:
+            shutil.rmtree(place, ignore_errors=True)
+        for place in places:
+            if place.exists():
+                raise InstallError(f"{place} is in use. Close other Blenders, then press Remove again.")
 
 
 def install(options: Options, report: Report, cancelled: threading.Event, lock: Path = LOCK) -> dict[str, Any]:

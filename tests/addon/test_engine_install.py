@@ -120,6 +120,13 @@ def test_broken_package_says_so_and_the_next_try_goes_on(options, lock, tmp_path
     assert place.installed(options.folder)
 
 
+def test_what_cannot_be_removed_is_told(tmp_path, monkeypatch):
+    (tmp_path / "venv").mkdir()
+    monkeypatch.setattr(module.shutil, "rmtree", lambda *_, **how: None)  # as Windows does while a program in it runs
+    with pytest.raises(InstallError, match="venv is in use"):
+        module.remove(tmp_path)
+
+
 def test_habits_of_the_user_do_not_keep_packages_out_of_the_environment(
     options, lock, tmp_path, content_doctor, monkeypatch
 ):

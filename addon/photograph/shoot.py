@@ -53,8 +53,8 @@ def class_ids(scene: bpy.types.Scene, source: LabelSource) -> dict[str, int]:
     """Names and ids (1 …) of the classes that `source` distinguishes in the scene, in a stable order.
 
     "material" and "object": what has a pass index set keeps it (several may share one: the first name wins); if none
-    has, they are numbered by name. "collection": the collections directly below the scene's; what lies in none of
-    them is void.
+    has, they are numbered by name. "collection": the collections directly below the scene's, with what they
+    hold instances of; what lies in none of them is void.
     """
     if source == "none":
         return {}
@@ -252,14 +252,26 @@ def _camera(scene: bpy.types.Scene) -> Iterator[None]:
         bpy.data.cameras.remove(data)
 
 
+def _members(collection: bpy.types.Collection) -> dict[bpy.types.Object, None]:
+    """The objects of a collection, those below it, and those of collections of which they are instances."""
+    found, left, seen = {}, [collection], {collection}
+    while left:
+        objects = left.pop().all_objects
+        found |= dict.fromkeys(objects)
+        inside = {item.instance_collection for item in objects if item.instance_type == "COLLECTION"} - {None, *seen}
+        seen |= inside
+        left += inside
+    return found
+
+
 @contextmanager
 def _indexed(scene: bpy.types.Scene, source: LabelSource) -> Iterator[None]:
     """Give materials or objects the pass index of their class while the block runs."""
     ids = class_ids(scene, source)
     items: list[tuple[Any, int]] = []
     if source == "collection":
-        number = {o: ids[c.name] for c in scene.collection.children for o in c.all_objects}
-        items = [(o, number.get(o, 0)) for o in bpy.data.objects if o.library is None]
+        number = {o: ids[c.name] for c in scene.collection.children for o in _members(c)}
+        items = [(o, number.get(o, 0)) for o in bpy.data.objects]
     elif source in {"material", "object"}:
         found = _items(scene, source)
         if not any(item.pass_index for item in found):

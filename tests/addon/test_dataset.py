@@ -197,6 +197,37 @@ def test_dots_in_names_of_view_layers_and_cameras_that_are_none_do_not_matter(bl
         take(tmp_path / "odd.blend", tmp_path / "path", path="camera")
 
 
+LINKED = """
+bpy.ops.wm.open_mainfile(filepath=blend)
+bpy.data.scenes[0].collection.children.unlink(bpy.data.collections["things"])
+bpy.data.collections["things"].use_fake_user = True
+bpy.ops.wm.save_as_mainfile(filepath=library, copy=True)
+bpy.data.collections.remove(bpy.data.collections["things"])
+with bpy.data.libraries.load(library, link=True) as (_, wanted):
+    wanted.collections = ["things"]
+holder = bpy.data.collections.new("holder")
+bpy.context.scene.collection.children.link(holder)
+if instance:
+    empty = bpy.data.objects.new("instance", None)
+    empty.instance_type, empty.instance_collection = "COLLECTION", wanted.collections[0]
+    holder.objects.link(empty)
+else:
+    holder.children.link(wanted.collections[0])
+bpy.ops.wm.save_as_mainfile(filepath=path, copy=True)
+answer(1)
+"""
+
+
+@pytest.mark.parametrize("instance", [False, True])
+def test_what_is_linked_from_another_file_has_the_class_of_its_collection(blend, tmp_path, bpy_script, instance):
+    bpy_script(LINKED, blend=blend, path=tmp_path / "here.blend", library=tmp_path / "library.blend", instance=instance)
+    take(tmp_path / "here.blend", tmp_path / "out", views=1, labels="collection")
+    classes = json.loads((tmp_path / "out/classes.json").read_text())["classes"]
+    found = {classes[str(number)]: places for number, places in surfaces(tmp_path / "out").items() if number}
+    assert set(found) == {"ground", "holder"}
+    assert found["holder"][:, 2].max() > 0.9, "the cube"
+
+
 NUMBERS = """
 bpy.ops.wm.open_mainfile(filepath=blend)
 for name, number in (("floor", 300), ("cube", 2)):

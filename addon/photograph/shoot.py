@@ -67,22 +67,17 @@ def class_ids(scene: bpy.types.Scene, source: LabelSource) -> dict[str, int]:
             if item.pass_index:
                 found.setdefault(item.pass_index, item.name)
         return {name: number for number, name in sorted(found.items())}
-    return {item.name: number for number, item in enumerate(items, 1)}
+    return {name: number for number, name in enumerate(sorted({item.name for item in items}), 1)}
 
 
 def _items(scene: bpy.types.Scene, source: LabelSource) -> list[Any]:
-    """The objects that render, or their materials, by name; also those that come in by instancing."""
-    objects = {}
-    for instance in bpy.context.evaluated_depsgraph_get().object_instances:
-        item = instance.object.original
-        if item.type in SURFACES and not item.hide_render:
-            objects[item.name] = item
-    if source == "object":
-        return [item for _, item in sorted(objects.items())]
-    materials = {
-        slot.material.name: slot.material for o in objects.values() for slot in o.material_slots if slot.material
-    }
-    return [material for _, material in sorted(materials.items())]
+    """The objects that render, or their materials, by name; also those that come in by instancing, and from other files, where
+    they may be called as those here."""
+    instances = (each.object.original for each in bpy.context.evaluated_depsgraph_get().object_instances)
+    found = {item for item in instances if item.type in SURFACES and not item.hide_render}
+    if source != "object":
+        found = {slot.material for item in found for slot in item.material_slots if slot.material}
+    return sorted(found, key=lambda item: item.name_full)
 
 
 def photograph(

@@ -228,6 +228,31 @@ def test_what_is_linked_from_another_file_has_the_class_of_its_collection(blend,
     assert found["holder"][:, 2].max() > 0.9, "the cube"
 
 
+NAMESAKES = """
+bpy.ops.wm.open_mainfile(filepath=blend)
+own, other = bpy.data.materials["paint of floor"], bpy.data.materials["paint of cube"]
+own.name, other.name = "kept", "paint"
+bpy.ops.wm.save_as_mainfile(filepath=library, copy=True)
+bpy.data.objects.remove(bpy.data.objects["cube"])
+bpy.data.materials.remove(other)
+own.name = "paint"
+with bpy.data.libraries.load(library, link=True) as (_, wanted):
+    wanted.collections = ["things"]
+bpy.context.scene.collection.children.link(wanted.collections[0])
+bpy.ops.wm.save_as_mainfile(filepath=path, copy=True)
+answer(1)
+"""
+
+
+def test_materials_of_two_files_that_have_one_name_are_one_class(blend, tmp_path, bpy_script):
+    bpy_script(NAMESAKES, blend=blend, path=tmp_path / "here.blend", library=tmp_path / "library.blend")
+    take(tmp_path / "here.blend", tmp_path / "out", views=1)
+    places = surfaces(tmp_path / "out")
+    assert set(places) == {0, 1}
+    assert places[1][:, 2].max() > 0.9, "the cube"
+    assert np.abs(places[1][:, :2]).max() > 1.5, "the floor"
+
+
 NUMBERS = """
 bpy.ops.wm.open_mainfile(filepath=blend)
 for name, number in (("floor", 300), ("cube", 2)):

@@ -96,7 +96,7 @@ def _damage_told(path: Path, kind: str) -> Iterator[None]:
     """Turn what a reader trips over, where a file holds something else than the tool writes, into an InputError."""
     try:
         yield
-    except (AttributeError, TypeError, ValueError, LookupError, ArithmeticError, MemoryError) as error:
+    except (AttributeError, TypeError, ValueError, LookupError, ArithmeticError) as error:
         raise InputError(f"{path} is damaged ({kind}): {error!r}.", "Export the labels once more.") from error
 
 

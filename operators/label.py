@@ -350,8 +350,15 @@ class FIELDWORK_OT_label_size(Operator):
         return {"FINISHED"}
 
 
+def cutting_out(folder: Path) -> Job | None:
+    """The job that cuts something out of a photo, where nothing was drawn since it was asked for: that is what undo means."""
+    jobs = [job for job in (queue.running, *queue.waiting) if job is not None and job.state != "cancelling"]
+    job = next((job for job in jobs if job.verb == "assist segment" and job.project == folder), None)
+    return job if job is not None and job.params.get("drawn_on") == pending.shown(folder) else None
+
+
 class FIELDWORK_OT_label_undo(Operator):
-    """Take back a mark that the engine is about to take"""
+    """Take back a mark that the engine is about to take or to make"""
 
     bl_idname = "fieldwork.label_undo"
     bl_label = "Undo Mark"
@@ -360,13 +367,18 @@ class FIELDWORK_OT_label_undo(Operator):
     @classmethod
     def poll(cls, context: Context) -> bool:
         folder = snapshot.folder_of(context.scene.fieldwork)
-        return folder is not None and pending.unfinished(folder)  # else the key is Blender's
+        # Else the key is Blender's.
+        return folder is not None and (pending.unfinished(folder) or cutting_out(folder) is not None)
 
     def execute(self, context: Context) -> set[str]:
         folder = snapshot.folder_of(context.scene.fieldwork)
         if folder is None:
             return {"CANCELLED"}
-        session.undo_later(folder)
+        job = None if pending.unfinished(folder) else cutting_out(folder)
+        if job is not None:
+            queue.cancel(job)
+        else:
+            session.undo_later(folder)
         return {"FINISHED"}
 
 

@@ -351,6 +351,38 @@ answer(seen)
     assert facts[-1] == [0, 0, False]
 
 
+def test_undo_of_what_is_being_cut_out_cancels_that(bpy_script, tmp_path):
+    """Unless something was drawn since: then that is undone."""
+    facts = bpy_script(
+        SETUP
+        + """
+from fieldwork.addon.jobs.queue import queue
+from fieldwork.addon.labels import pending
+folder, cancelled, seen = Path(project), [], []
+settings.project = project
+can = bpy.ops.fieldwork.label_undo.poll
+seen.append(can())
+queue.running = queue.make("assist segment", {"project": project, "drawn_on": 0})
+queue.running.state = "running"
+queue.cancel = lambda job: (cancelled.append(job.verb), setattr(job, "state", "cancelling"))
+seen.append(can())
+bpy.ops.fieldwork.label_undo()
+seen += [list(cancelled), can()]
+queue.running.state = "running"
+queue.running.params["drawn_on"] = 3
+seen.append(can())
+queue.running.params["drawn_on"] = 0
+pending.mark(folder, {"photo": "a"})
+bpy.ops.fieldwork.label_undo()
+seen.append(len(cancelled))
+queue.running = None
+answer(seen)
+""",
+        project=project_without_marks(tmp_path / "p"),
+    )
+    assert facts == [False, True, ["assist segment"], False, False, 1]
+
+
 def project_without_marks(folder: Path) -> Path:
     project_with_labels(folder)
     for path in (folder / "marks").iterdir():

@@ -275,7 +275,7 @@ def test_photos_that_meshroom_did_not_place_are_named(tmp_path: Path) -> None:
     Image.new("RGB", (60, 40)).save(tmp_path / "a.png")
     pose = {"rotation": [str(v) for v in np.eye(3).ravel()], "center": ["0", "0", "0"]}
     value = {
-        "views": [{"viewId": i, "poseId": i, "intrinsicId": "1", "path": f"/gone/{i}.png"} for i in "abc"],
+        "views": [{"viewId": i, "poseId": i, "intrinsicId": "1", "path": rf"C:\gone\{i}.png"} for i in "abc"],
         "intrinsics": [{"intrinsicId": "1", "width": "60", "height": "40", "pxFocalLength": "50", "type": "pinhole"}],
         "poses": [{"poseId": "a", "pose": {"transform": pose}}],
     }

@@ -55,11 +55,11 @@ def read(folder: Path) -> Dataset:
         poses = {entry["poseId"]: entry["pose"]["transform"] for entry in value.get("poses", [])}
         rigs = {entry["rigId"]: entry["subPoses"] for entry in value.get("rigs") or []}
         placed = [view for view in value["views"] if view.get("poseId") in poses]
-        without = [Path(view["path"]).name for view in value["views"] if view.get("poseId") not in poses]
+        without = [_source(view).name for view in value["views"] if view.get("poseId") not in poses]
         shared = Counter(view["poseId"] for view in placed)
         entries = [
             (
-                Path(view["path"]),
+                _source(view),
                 intrinsics[view["intrinsicId"]],
                 poses[view["poseId"]],
                 _place_in_rig(view, rigs, shared[view["poseId"]] > 1),
@@ -101,6 +101,11 @@ def read(folder: Path) -> Dataset:
     warnings = [shortened(not_imported(len(without), path), without)] if without else []
     warnings += [f"{len(missing)} photos of the export are missing (first: {missing[0]})."] if missing else []
     return Dataset("meshroom", views, frame, confidence, warnings=warnings)
+
+
+def _source(view: dict[str, Any]) -> Path:
+    """Where a photo was, on a machine that may have had backslashes in its paths."""
+    return Path(view["path"].replace("\\", "/"))
 
 
 def _place_in_rig(view: dict[str, Any], rigs: dict[Any, Any], shared: bool) -> dict[str, Any] | None:

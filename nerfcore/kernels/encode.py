@@ -28,8 +28,9 @@ P2 = wp.constant(wp.uint32(805459861))
 @wp.func
 def corner_rows(ix: int, iy: int, iz: int, resolution: int, size: int, base: int):
     """Table rows of the four corner pairs along x: (x0y0z0, x0y1z0, x0y0z1, x0y1z1) and the same with x1."""
-    # resolution³ would overflow 32 bits from 1291 on
-    if resolution * resolution <= size / resolution:
+    side = wp.int64(resolution)
+    # In 32 bits resolution³ would overflow from 1291 on.
+    if side * side * side <= wp.int64(size):
         row = base + (iz * resolution + iy) * resolution + ix
         plane = resolution * resolution
         low = wp.vec4i(row, row + resolution, row + plane, row + plane + resolution)

@@ -42,13 +42,18 @@ def test_encode_equals_its_reference_and_so_does_its_gradient(device: torch.devi
     assert torch.equal(touched.bool() & blocks, blocks)
 
 
-def test_a_level_of_more_vertices_than_32_bits_number_is_hashed(device: torch.device) -> None:
+@pytest.mark.parametrize("resolution", [1300, 50000])  # its third, and its second power is beyond 2³¹
+def test_a_level_of_more_vertices_than_32_bits_number_is_hashed(device: torch.device, resolution: int) -> None:
     generator = torch.Generator().manual_seed(13)
-    levels = [(1300, 0, 1 << 21)]  # 1300³ is beyond 2³¹
+    levels = [(resolution, 0, 1 << 21)]
     table = torch.randn(1 << 21, encode.FEATURES, generator=generator).to(device)
-    points = (torch.rand(200, 3, generator=generator) / 1300).to(device)
+    points = (torch.rand(200, 3, generator=generator) / resolution).to(device).requires_grad_()
     expected = encode_reference.forward(table, levels, [1.0], points)
-    assert relative(encode.forward(table, levels, [1.0], points), expected) <= 1e-5
+    assert relative(encode.forward(table, levels, [1.0], points.detach()), expected) <= 1e-5
+    expected.sum().backward()
+    ours = encode_points.backward_points(table, levels, [1.0], points.detach(), torch.ones_like(expected))
+    assert points.grad is not None
+    assert relative(ours, points.grad) <= 1e-4
 
 
 def test_the_gradient_of_encoded_points_equals_its_reference(device: torch.device) -> None:

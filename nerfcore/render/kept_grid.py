@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -16,6 +17,13 @@ from ..sampling.render_grid import FineDensity
 
 log = logging.getLogger("fieldwork")
 VERSION = 1
+
+
+def read_tensor(file: Any, name: str) -> torch.Tensor:
+    """A tensor of an open safetensors file, in memory of its own: what is read for the CPU is the mapped file itself, which
+    Windows does not let anybody replace while a tensor of it is left."""
+    tensor: torch.Tensor = file.get_tensor(name)
+    return tensor.clone() if tensor.device.type == "cpu" else tensor
 
 
 @dataclass(frozen=True)
@@ -36,7 +44,7 @@ class KeptGrid:
             with safe_open(self.path, "pt", device=str(device)) as file:
                 if file.metadata() != self._belongs_to(factor):
                     return None
-                return FineDensity(file.get_tensor("coarse"), file.get_tensor("density"))
+                return FineDensity(read_tensor(file, "coarse"), read_tensor(file, "density"))
         except (SafetensorError, OSError) as error:
             log.info("%s is read anew: %s", self.path, error)
             return None

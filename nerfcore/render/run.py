@@ -25,7 +25,7 @@ from ..progress import Reporter, shortened
 from ..project.runs import CHECKPOINT, HOLDOUT, INFO, run_folder, settle, state_id
 from ..project.schema import Poses, Project
 from ..project.store import load_project, world_from_sfm
-from .kept_grid import KeptGrid
+from .kept_grid import KeptGrid, read_tensor
 from .migration import migrate_info, migrate_tensors
 from .model import Model
 
@@ -251,6 +251,6 @@ def read_checkpoint(path: Path, device: torch.device) -> tuple[dict[str, torch.T
         with safe_open(path, "pt", device=str(device)) as file:
             state = json.loads((file.metadata() or {})["fieldwork"])
             names = list(file.keys())
-            return migrate_tensors({name: file.get_tensor(name) for name in names}), state
+            return migrate_tensors({name: read_tensor(file, name) for name in names}), state
     except (SafetensorError, KeyError, json.JSONDecodeError, OSError) as error:
         raise ProjectError(f"{path} is damaged: {error}.", "Train the run again.") from error

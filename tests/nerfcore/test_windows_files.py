@@ -7,11 +7,18 @@ import threading
 from pathlib import Path
 
 import pytest
+import torch
 from fieldwork.nerfcore import files
 from fieldwork.nerfcore.engine import status as st
 from fieldwork.nerfcore.errors import DiskError
 from fieldwork.nerfcore.files import write_json, write_text
+from fieldwork.nerfcore.params import TrainParams
+from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.project.runs import fresh_folder, run_folder, swap_in
+from fieldwork.nerfcore.render.kept_grid import KeptGrid
+from fieldwork.nerfcore.sampling.render_grid import FineDensity
+from fieldwork.nerfcore.train.verb import train
+from fieldwork.tests.nerfcore.support.ball import SMALL, ball_project
 from fieldwork.tests.nerfcore.support.windows_files import behave_like_windows, closes_after
 
 pytestmark = pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="what is open is read from /proc")
@@ -31,6 +38,10 @@ def test_the_stand_in_refuses_what_windows_refuses(tmp_path: Path) -> None:
         for refused in (path.unlink, lambda: os.replace(path, tmp_path / "b"), lambda: os.rename(tmp_path, tmp_path)):
             with pytest.raises(PermissionError, match="in use"):
                 refused()
+    mapped = torch.UntypedStorage.from_file(str(path), False, 1)  # its file is closed
+    with pytest.raises(PermissionError, match="in use"):
+        os.replace(tmp_path / "c", path)
+    del mapped
     os.replace(path, tmp_path / "b")
     assert (tmp_path / "b").read_text() == "a"
 
@@ -81,3 +92,22 @@ def test_a_job_begins_while_that_of_an_earlier_one_is_read(tmp_path: Path) -> No
         st.prune_jobs(tmp_path, new)
     st.prune_jobs(tmp_path, new)
     assert [path.name for path in (tmp_path / st.FOLDER).iterdir()] == ["new.json"]
+
+
+def test_a_training_that_goes_on_replaces_the_checkpoint_that_it_came_from(tmp_path: Path) -> None:
+    project = ball_project(tmp_path / "ball", views=6, side=16)
+    params = TrainParams(project=project, preset="draft", steps=3, set=SMALL)
+    train(params, Reporter())
+    result = train(params.model_copy(update={"steps": 5, "resume": True}), Reporter())
+    assert result["steps"] == 5
+
+
+def test_a_kept_grid_is_replaced_while_it_is_used(tmp_path: Path) -> None:
+    kept = KeptGrid(tmp_path / "grid.safetensors", "one")
+    kept.save(2, FineDensity(torch.arange(3).int(), torch.ones(3, 8).half()))
+    used = kept.load(2, torch.device("cpu"))
+    assert used is not None
+    kept.save(2, used.with_more(FineDensity(torch.tensor([7]).int(), torch.ones(1, 8).half())))
+    more = kept.load(2, torch.device("cpu"))
+    assert more is not None
+    assert more.coarse.tolist() == [0, 1, 2, 7]

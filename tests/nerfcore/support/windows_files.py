@@ -1,7 +1,7 @@
 """A file system with the manners of Windows, for tests on Linux.
 
 Windows syncs only files that are open for writing, and neither replaces, renames nor deletes what a program has open
-(Python opens without the right to delete). Only what this process has open counts here.
+(Python opens without the right to delete) or mapped into its memory. Only what this process has counts here.
 """
 
 from __future__ import annotations
@@ -10,13 +10,14 @@ import os
 import shutil
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import pytest
 from fieldwork.nerfcore import files
 
-OPEN_FILES = Path("/proc/self/fd")
+OPEN_FILES, MAPPED_FILES = Path("/proc/self/fd"), Path("/proc/self/maps")
 
 
 @pytest.fixture(params=["posix", "windows"])
@@ -60,16 +61,20 @@ def _refusing(call: Callable[..., None]) -> Callable[..., None]:
 
 
 def _open_below(path: Any) -> str | None:
-    """A file that this process has open at `path` or in it."""
+    """A file that this process has open at `path` or in it, or mapped."""
     wanted = os.path.realpath(os.fsdecode(path))
-    for number in os.listdir(OPEN_FILES):
-        try:
-            held = os.readlink(OPEN_FILES / number)
-        except OSError:  # the handle of this very listing
-            continue
+    for held in _open_and_mapped():
         if held == wanted or held.startswith(wanted + os.sep):
             return held
     return None
+
+
+def _open_and_mapped() -> Iterator[str]:
+    for number in os.listdir(OPEN_FILES):
+        with suppress(OSError):  # the handle of this very listing
+            yield os.readlink(OPEN_FILES / number)
+    for line in MAPPED_FILES.read_text(errors="surrogateescape").splitlines():
+        yield line.split(maxsplit=5)[-1]
 
 
 def closes_after(file: Any, seconds: float) -> None:

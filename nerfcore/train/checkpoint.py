@@ -85,8 +85,17 @@ def restore(trainer: Trainer, tensors: dict[str, torch.Tensor], state: dict[str,
     if trainer.sky is not None:
         trainer.sky.share.copy_(tensors.get("sky_share", trainer.sky.share))
         trainer.sky.needed = state.get("sky_masks", True)  # older trainings had them from the first step on
-    trainer.generator.set_state(tensors["generator"].cpu())
+    _restore_generator(trainer, tensors["generator"].cpu(), state["steps"])
     trainer.guard.scale = tensors.get("loss_scale", trainer.guard.scale)
     trainer.guard.good_steps = tensors.get("loss_scale_steps", trainer.guard.good_steps)
     trainer.cache.hit = tensors.get("cache.hit")
     trainer.steps, trainer.rays = state["steps"], state["rays"]
+
+
+def _restore_generator(trainer: Trainer, saved: torch.Tensor, steps: int) -> None:
+    """Let random numbers go on as they would have; after another kind of device, whose generators have states of another size,
+    with other ones than those of the first steps."""
+    if len(saved) == len(trainer.generator.get_state()):
+        trainer.generator.set_state(saved)
+    else:
+        trainer.generator.manual_seed(trainer.config.train.seed + steps)

@@ -26,6 +26,7 @@ from fieldwork.nerfcore.project.store import load_project, save_poses, save_proj
 from fieldwork.nerfcore.render.model import Model
 from fieldwork.nerfcore.render.run import read_checkpoint
 from fieldwork.nerfcore.render.verb import look_at
+from fieldwork.nerfcore.train.checkpoint import write_checkpoint
 from fieldwork.nerfcore.verbs import run_verb
 from fieldwork.tests.nerfcore.support.ball import SMALL
 from PIL import Image
@@ -250,6 +251,15 @@ def test_a_resumed_training_equals_an_uninterrupted_one(tiny_project: Path) -> N
     assert whole.keys() == parts.keys()
     different = [name for name in whole if not torch.equal(whole[name], parts[name])]
     assert different == []
+
+
+def test_a_training_goes_on_on_another_kind_of_device(tiny_project: Path) -> None:
+    """Its generator of random numbers has a state of another size there."""
+    train(tiny_project, "moved", 5)
+    path = tiny_project / "runs" / "moved" / "field.safetensors"
+    saved, state = read_checkpoint(path, torch.device("cpu"))
+    write_checkpoint(path, {**saved, "generator": torch.zeros(16, dtype=torch.uint8)}, state)
+    assert train(tiny_project, "moved", 8, resume=True)["steps"] == 8
 
 
 def test_cancel_takes_less_than_two_seconds_and_leaves_a_checkpoint(tiny_project: Path) -> None:

@@ -130,7 +130,11 @@ def training_views(scene: Scene, config: RunConfig) -> list[int]:
 
 
 def make_trainer(project_folder: Path, info: RunInfo, scene: Scene, device: torch.device, report: Reporter) -> Trainer:
-    """Load the pixels and build the trainer of a run."""
+    """Load the pixels and build the trainer of a run.
+
+    Raises:
+        TrainingError: a photo of the run is gone from the project, or masks leave nothing of the photos.
+    """
     config = info.config
     names = {view.name: i for i, view in enumerate(scene.views)}
     missing = [name for name in info.images if name not in names]
@@ -152,6 +156,8 @@ def make_trainer(project_folder: Path, info: RunInfo, scene: Scene, device: torc
         report,
         photo_budget(config, device),
     )
+    if store.usable is not None and not len(store.usable):
+        raise TrainingError("The masks leave nothing of the photos to train on.", "White in a mask marks what counts.")
     if store.home != device:
         report.warn(
             f"{len(store) / 1e6:.0f} million pixels are more than the device's memory has room for "

@@ -12,6 +12,7 @@ from ..errors import ProjectError
 from ..files import UNREADABLE_ARRAYS, atomic_path
 from ..geometry.similarity import similarity_scale
 from ..kernels.depth_arrays import FREE, MapArrays
+from ..kernels.device import kernel_device
 
 EDGE = 1e-4  # of a box's size: rays that touch its side are inside
 
@@ -98,7 +99,9 @@ def save_maps(path: Path, maps: MapArrays) -> None:
 
 
 def load_maps(path: Path, device: torch.device) -> MapArrays:
-    """Raises ProjectError: there are none, or the file is damaged."""
+    """The maps as kernels read them, on the host where the device has no Warp. Raises ProjectError: there are none, or the
+    file is damaged."""
+    device = kernel_device(device)
     try:
         with np.load(path, allow_pickle=False) as data:
             return MapArrays(**{f.name: torch.from_numpy(data[f.name]).to(device) for f in fields(MapArrays)})

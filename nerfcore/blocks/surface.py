@@ -111,7 +111,7 @@ def make_part(
         vertices, triangles, inside = decimate_patches(vertices, triangles, inside.astype(np.int64), target, report)
         inside = inside.astype(bool)
     free = away_from(seams, vertices, FADE * region.voxel)
-    vertices = denoised(vertices, triangles, device, report, free)
+    vertices = denoised(vertices, triangles, maps.depth.device, report, free)
     box = trained.info.box(project)
     box_from_common = box.box_from_world @ plan.world_from_common
     views = spread_views([scene.views[i] for i in scene.train], MOST_VIEWS)

@@ -69,4 +69,4 @@ def refit_camera(
             gradients = torch.autograd.grad(loss, (batch.origins, batch.directions), allow_unused=True)
             rays_ = batch.origins, batch.directions
             refinement.step([[torch.zeros_like(r) if g is None else g for r, g in zip(rays_, gradients)]], step / STEPS)
-    return refinement.poses(rays)[0].double().cpu().numpy()
+    return refinement.poses(rays)[0].cpu().double().numpy()

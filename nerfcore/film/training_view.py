@@ -67,11 +67,9 @@ class _View:
     step: int = -1
 
 
-def view_rays(
-    request: LiveRequest, width: int, height: int, device: torch.device
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+def view_rays(request: LiveRequest, width: int, height: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Origins and unit directions (N, 3) and lengths (N,) of the rays of a picture of this size, bottom row first, between
-    the planes that clip the view; float64."""
+    the planes that clip the view; float64, on the host."""
     y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
     across, up = (x.reshape(-1).double() + 0.5) / width * 2 - 1, (y.reshape(-1).double() + 0.5) / height * 2 - 1
     matrix = torch.tensor(request.scene_from_clip, dtype=torch.float64)
@@ -81,7 +79,7 @@ def view_rays(
         ends.append(point[:, :3] / point[:, 3:])
     way = ends[1] - ends[0]
     length = way.norm(dim=1)
-    return ends[0].to(device), (way / length[:, None]).to(device), length.to(device)
+    return ends[0], way / length[:, None], length
 
 
 @torch.no_grad()
@@ -95,25 +93,27 @@ def view_picture(
     """
     # Few rays, and packed anew for each picture: not worth the compilation of the fused kernel.
     placed = PlacedField(field, request.field, 0)
-    origins, directions, lengths = view_rays(request, width, height, placed.device)
-    clip = torch.linalg.inv(torch.tensor(request.scene_from_clip, dtype=torch.float64)).to(placed.device)
+    origins, directions, lengths = view_rays(request, width, height)
+    clip = torch.linalg.inv(torch.tensor(request.scene_from_clip, dtype=torch.float64))
 
     @torch.no_grad()
     def tile(rows: torch.Tensor) -> torch.Tensor:
         check()
         o, d = origins[rows], directions[rows]
         begin = torch.zeros(len(rows), device=placed.device)
-        seen = placed.rays(o.float(), d.float(), begin, lengths[rows].float())
-        point = o + d * seen.distance.double()[:, None]
+        own = (x.float().to(placed.device) for x in (o, d))
+        seen = placed.rays(*own, begin, lengths[rows].float().to(placed.device))
+        # Depths on the host: Apple's GPUs have no float64.
+        point = o + d * seen.distance.cpu().double()[:, None]
         place = torch.cat([point, torch.ones_like(point[:, :1])], 1) @ clip.T
         depth = (place[:, 2] / place[:, 3] * 0.5 + 0.5).nan_to_num(1.0).clamp(0, 1).float()
-        solid = seen.opacity > LEAST
-        color = torch.cat([seen.color, seen.opacity[:, None]], 1) * solid[:, None]
-        return torch.cat([color, torch.where(solid, depth, 1.0)[:, None]], 1)
+        color = torch.cat([seen.color, seen.opacity[:, None]], 1).cpu()
+        solid = color[:, 3] > LEAST
+        return torch.cat([color * solid[:, None], torch.where(solid, depth, 1.0)[:, None]], 1)
 
     size = CPU_RAYS if placed.device.type == "cpu" else GPU_RAYS
-    rows = torch.arange(width * height, device=placed.device)
-    found = torch.cat(run_parallel([partial(tile, part) for part in rows.split(size)], placed.device)).cpu()
+    rows = torch.arange(width * height)
+    found = torch.cat(run_parallel([partial(tile, part) for part in rows.split(size)], placed.device))
     return found[:, :4].reshape(height, width, 4), found[:, 4].reshape(height, width)
 
 

@@ -155,6 +155,11 @@ def on_host(device: torch.device) -> bool:
     return device.type == "cpu" and backend_of(device).warp
 
 
+def kernel_device(device: torch.device) -> torch.device:
+    """Where kernels that only Warp has run: on the device itself, or on the host where Warp does not serve it."""
+    return device if backend_of(device).warp else torch.device("cpu")
+
+
 def use_device() -> torch.device:
     """`choose_device`, with torch set up for it: as many threads as the engine may use, memory that is used again, and
     on the device at hand."""

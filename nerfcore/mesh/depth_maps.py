@@ -18,7 +18,7 @@ from ..data.scene import View
 from ..geometry.cameras import Camera, pixel_centers, project, rays
 from ..kernels.depth_arrays import FREE, MapArrays
 from ..kernels.depth_normals import depth_normals
-from ..kernels.device import backend_of
+from ..kernels.device import kernel_device
 from ..kernels.march import sample
 from ..kernels.runtime import run_parallel
 from ..kernels.surface import able_views, agreement, depth_quantiles
@@ -269,7 +269,7 @@ def pixel_directions(camera: Camera) -> np.ndarray:
 def map_arrays(views: list[FlatView], maps: list[DepthMap], device: torch.device) -> MapArrays:
     """The maps as the kernels read them, without what is seen under less than 10° and without outlines; on the host where
     the device has no Warp."""
-    device = device if backend_of(device).warp else torch.device("cpu")
+    device = kernel_device(device)
     sizes = torch.tensor([[v.camera.width, v.camera.height] for v in views], dtype=torch.int32)
     inverse = np.stack([np.linalg.inv(v.pose) for v in views]).astype(np.float32)
 

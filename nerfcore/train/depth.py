@@ -69,7 +69,7 @@ def find_depths(
     """
     points = transform_points(box_from_world, scene.points.xyz)
     trust = point_trust(scene.points.error)
-    poses = store.rays.rotation.double().cpu().numpy(), store.rays.center.double().cpu().numpy()
+    poses = store.rays.rotation.cpu().double().numpy(), store.rays.center.cpu().double().numpy()
     alpha = store.rgba[:, 3].cpu().numpy() > 127
     usable = np.ones(len(store), bool)
     if store.usable is not None:

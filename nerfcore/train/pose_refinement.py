@@ -152,7 +152,7 @@ def level_weights(levels: int, progress: float) -> list[float]:
 
 def write_poses(path: Path, refinement: PoseRefinement, rays: CameraRays, names: list[str], sfm_from_box: np.ndarray):
     """The refined cameras in the SfM frame, in the form of a project's poses.json. Raises DiskError."""
-    poses = refinement.poses(rays).double().cpu().numpy()
+    poses = refinement.poses(rays).cpu().double().numpy()
     moved = sfm_from_box @ poses
     moved[:, :3, :3] /= similarity_scale(sfm_from_box)
     cameras = list(dict.fromkeys(rays.cameras))

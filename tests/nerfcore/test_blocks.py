@@ -250,6 +250,7 @@ def test_maps_in_another_frame_show_the_same_places(tmp_path: Path) -> None:
     save_maps(tmp_path / "maps.npz", other)
     stored = load_maps(tmp_path / "maps.npz", CPU)
     assert all(torch.equal(getattr(stored, name), value) for name, value in vars(other).items())
+    assert load_maps(tmp_path / "maps.npz", torch.device("mps")).depth.device == CPU, "Warp has no kernels for it"
     (tmp_path / "maps.npz").write_bytes(b"PK\x03\x04 broken")
     with pytest.raises(ProjectError, match="damaged"):
         load_maps(tmp_path / "maps.npz", CPU)

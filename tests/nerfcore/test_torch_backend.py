@@ -4,15 +4,24 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
+from fieldwork.nerfcore.evaluate.refit import refit_camera
+from fieldwork.nerfcore.film import training_view
+from fieldwork.nerfcore.film.fields import described
 from fieldwork.nerfcore.kernels import runtime
 from fieldwork.nerfcore.kernels.device import Kernels, using_kernels
+from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.render.fused import unsupported
+from fieldwork.nerfcore.train.pose_refinement import write_poses
+from fieldwork.nerfcore.train.prepare import make_trainer, plan_run
 from fieldwork.nerfcore.train.trainer import Trainer
 from fieldwork.tests.nerfcore.support.ball import ball_project
-from fieldwork.tests.nerfcore.support.settings import trainer_of
+from fieldwork.tests.nerfcore.support.settings import config_of, trainer_of
 from fieldwork.tests.nerfcore.support.sky import under_the_sky
+from fieldwork.tests.nerfcore.support.viewing import perspective
+from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
@@ -33,6 +42,22 @@ class DoublePrecision(TorchDispatchMode):
         out = func(*args, **(kwargs or {}))
         if any(isinstance(x, torch.Tensor) and x.dtype == torch.float64 and x.dim() > 0 for x in tree_leaves(out)):
             self.found.append(func.overloadpacket.__name__)
+        return out
+
+
+class AwayFromTheHost(TorchFunctionMode):
+    """Lets no tensor become float64 before it was brought to the host, as if all were on a device that has none."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.here: list[torch.Tensor] = []
+
+    def __torch_function__(self, func, types, args=(), kwargs=None):
+        if func is torch.Tensor.double and not any(args[0] is x for x in self.here):
+            raise TypeError("the device has no float64")
+        out = func(*args, **(kwargs or {}))
+        if func is torch.Tensor.cpu:
+            self.here.append(out)
         return out
 
 
@@ -97,6 +122,39 @@ def test_the_torch_backend_needs_neither_warp_nor_double_precision(
     assert doubles.found == []
     assert bool(torch.isfinite(out.color).all())
     assert trainer.take_measured().psnr > 5
+
+
+def test_what_the_host_makes_of_a_training_is_brought_to_it_before(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Lengths of rays, refined and fitted poses, and pictures for viewports, all made in double precision."""
+    project = ball_project(tmp_path / "ball", views=6, side=16, depth=True)
+    settings = {"loss.depth_weight": "0.1", "train.refine_poses": "true", "train.pose_start": "0"}
+    info, scene = plan_run(project, "draft", config_of(**settings), torch.device("cpu"))
+    with AwayFromTheHost():
+        trainer = make_trainer(project, info, scene, torch.device("cpu"), Reporter())
+        assert trainer.depths is not None
+        assert len(trainer.depths) > 0
+        assert trainer.poses is not None
+        write_poses(
+            tmp_path / "poses.json", trainer.poses, trainer.store.rays, info.images, np.array(info.sfm_from_box)
+        )
+        camera, pose = trainer.store.cameras[0], np.eye(4)
+        nothing = np.zeros((camera.height, camera.width), bool)
+        photo = np.zeros((camera.height, camera.width, 3), np.uint8)
+        found = refit_camera(trainer.model, camera, pose, photo, nothing, 0.0, lambda: None)
+    assert np.allclose(found, pose)
+    item = {"name": "ball", "project": project, "scene_from_capture": np.eye(4).tolist()}
+    clip = np.linalg.inv(perspective((0, -1.2, 0))).tolist()
+    asked = {"number": 1, "width": 8, "height": 8, "scene_from_clip": clip, "file": tmp_path / "view.pixels"}
+    field = described(trainer.model, project, "main", info, scene)
+    request = training_view.LiveRequest.model_validate({**asked, "field": item})
+    rays = training_view.view_rays(request, 8, 8)  # of the host
+    monkeypatch.setattr(training_view, "view_rays", lambda *_: rays)
+    with AwayFromTheHost():
+        color, depth = training_view.view_picture(field, request, 8, 8)
+    assert color.shape == (8, 8, 4)
+    assert bool(((depth >= 0) & (depth <= 1)).all())
 
 
 @pytest.mark.parametrize(("kernels", "cut"), [("warp", True), ("torch", False)])

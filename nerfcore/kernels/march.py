@@ -213,7 +213,7 @@ def sample(
         jitter: (R,) in [0, 1) shift of the bins along the ray, in bins; 0.5 when None.
         shift: (R · count,) in [0, 1) position of each sample within its share of the PDF; 0.5 when None.
         capacity: the fixed number of rays that may get samples, so that no count is read back from the device; rays
-            beyond it are dropped and counted, unused entries have ray index −1 and delta 0.
+            beyond it are left out, unused entries have ray index −1 and delta 0.
         ends: (R,) distances at which single rays end before the settings' far end.
     """
     device, rays = origins.device, len(origins)
@@ -224,7 +224,7 @@ def sample(
     )
     counts = sample_counts(bin_counts, count, settings.per_bin)
     end = torch.cumsum(counts, 0, dtype=torch.int32)
-    starts, dropped = end - counts, None
+    starts, left_out = end - counts, None
     if capacity is None:
         n = int(end[-1]) if rays else 0
         ray_indices = torch.empty(n, dtype=torch.int32, device=device)
@@ -232,12 +232,12 @@ def sample(
         n, wanted = capacity * count, counts
         counts = torch.where(end <= n, counts, 0).to(torch.int32)
         starts = torch.where(counts > 0, starts, 0)
-        dropped = ((wanted > 0) & (counts == 0)).sum()
+        left_out = (wanted > 0) & (counts == 0)
         ray_indices = torch.full((n,), -1, dtype=torch.int32, device=device)
     shift = torch.full((n,), 0.5, device=device) if shift is None else shift[:n]
     fill = torch.empty if capacity is None else torch.zeros
     points, t, deltas = fill(n, 3, device=device), fill(n, device=device), fill(n, device=device)
-    packed_info = PackedInfo(starts, counts, ray_indices, dropped)
+    packed_info = PackedInfo(starts, counts, ray_indices, left_out)
     if not backend_of(device).warp:
         out = points, t, deltas, ray_indices
         march_torch.draw(origins, directions, ends, cells, settings, jitter, shift, starts, counts, out)

@@ -13,13 +13,18 @@ class PackedInfo:
     sample's ray.
 
     Rays without samples have count 0 (and any start within the samples or at their end); unused entries of the samples
-    have ray index −1. dropped () or None: rays that were left out for want of capacity.
+    have ray index −1. left_out (R,) bool or None: rays that were left out for want of capacity.
     """
 
     starts: torch.Tensor
     counts: torch.Tensor
     ray_indices: torch.Tensor
-    dropped: torch.Tensor | None = None
+    left_out: torch.Tensor | None = None
+
+    @property
+    def dropped(self) -> torch.Tensor | None:
+        """How many rays were left out ()."""
+        return None if self.left_out is None else self.left_out.sum()
 
     def subset(self, kept: torch.Tensor, capacity: int | None = None) -> tuple[torch.Tensor, PackedInfo]:
         """Indices (M,) int64 of the samples where `kept` (N,) is true, and how those are packed once they are taken.
@@ -33,7 +38,7 @@ class PackedInfo:
         starts, ends = before[first], before[first + self.counts]
         if capacity is None:
             indices = kept.nonzero()[:, 0]
-            return indices, PackedInfo(starts, ends - starts, self.ray_indices[indices], self.dropped)
+            return indices, PackedInfo(starts, ends - starts, self.ray_indices[indices], self.left_out)
         fits = ends <= capacity  # rays stand one after the other: the first ones
         kept = kept & fits[self.ray_indices.long()]
         target = torch.where(kept, before[:-1], capacity).long()
@@ -42,6 +47,7 @@ class PackedInfo:
         indices = indices.scatter_(0, target, every)[:capacity]
         used = torch.arange(capacity, device=kept.device) < kept.sum()
         ray_indices = torch.where(used, self.ray_indices[indices], -1)
-        dropped = (~fits & (ends > starts)).sum() + (0 if self.dropped is None else self.dropped)
+        left_out = ~fits & (ends > starts)
+        left_out = left_out if self.left_out is None else left_out | self.left_out
         counts = torch.where(fits, ends - starts, 0)
-        return indices, PackedInfo(torch.where(fits, starts, 0), counts, ray_indices, dropped)
+        return indices, PackedInfo(torch.where(fits, starts, 0), counts, ray_indices, left_out)

@@ -268,7 +268,7 @@ class Model(nn.Module):
         values = torch.cat([color, torch.ones_like(weights)[:, None], visible.t[:, None]], 1)
         summed = weighted_sum(values, weights, visible.packed_info)
         probabilities = None if classes is None else self._probabilities(classes, weights, visible.packed_info)
-        environment = self._environment(directions, summed[:, 3], samples, codes, semantics)
+        environment = self._environment(directions, summed[:, 3], visible.packed_info, codes, semantics)
         shaded = (summed[:, :3], summed[:, 3], summed[:, 4], probabilities, environment)
         return Rendered(*shaded, weights, density, visible, samples.points, evaluated_density, visible_count)
 
@@ -371,18 +371,19 @@ class Model(nn.Module):
         self,
         directions: torch.Tensor,
         opacity: torch.Tensor,
-        samples: Samples,
+        packed_info: PackedInfo,
         codes: torch.Tensor | None,
         semantics: bool,
     ) -> EnvironmentRays | None:
-        """What is behind the field where it has this opacity (R,)."""
+        """What is behind the field where it has this opacity (R,); `packed_info` packs the visible samples."""
         if self.environment is None:
             return None
         if not torch.is_grad_enabled():
             return self.environment.visible_rays(self.field, directions, opacity, self.config.render.cull, semantics)
-        # Rays that met something and were left out for want of capacity do not show the environment.
-        shown = (samples.packed_info.counts > 0) | (samples.t_first < 0)
-        return self.environment.rays(self.field, directions, (1 - opacity) * shown, codes, semantics)
+        weight = 1 - opacity
+        if packed_info.left_out is not None:  # what they show was not read
+            weight = weight * ~packed_info.left_out
+        return self.environment.rays(self.field, directions, weight, codes, semantics)
 
     @torch.no_grad()
     def observe(self, rendered: list[Rendered]) -> None:

@@ -233,19 +233,21 @@ def test_only_rays_that_were_rendered_teach_the_environment(tmp_path: Path) -> N
     model = trainer.model
     model.fixed_capacity = True
     batch = trainer.store.batch(torch.arange(256))
-    rendered = model.render(batch.origins, batch.directions, 12, capacity=16)
-    assert rendered.environment is not None
-    dropped = (rendered.samples.t_first >= 0) & (rendered.opacity == 0)
-    assert int(dropped.sum()) > 100
-    assert bool((rendered.environment.weight[dropped] == 0).all())
-    assert float(rendered.environment.weight.detach().max()) > 0
-    rendered.environment.color.retain_grad()
-    loss, _ = composite_loss(batch, rendered, torch.zeros(256, 3), 0.0, config.loss, model)
-    loss.backward()
-    gradient = rendered.environment.color.grad
-    assert gradient is not None
-    assert bool((gradient[dropped] == 0).all())
-    assert float(gradient[~dropped].abs().max()) > 0
+    for capacity, visible in ((16, 1.0), (256, 0.01)):  # of rays, of visible samples
+        model.host_visible_share = visible
+        rendered = model.render(batch.origins, batch.directions, 12, capacity=capacity)
+        assert rendered.environment is not None
+        dropped = (rendered.samples.t_first >= 0) & (rendered.opacity == 0)
+        assert int(dropped.sum()) > 100
+        assert bool((rendered.environment.weight[dropped] == 0).all())
+        assert float(rendered.environment.weight.detach().max()) > 0
+        rendered.environment.color.retain_grad()
+        loss, _ = composite_loss(batch, rendered, torch.zeros(256, 3), 0.0, config.loss, model)
+        loss.backward()
+        gradient = rendered.environment.color.grad
+        assert gradient is not None
+        assert bool((gradient[dropped] == 0).all())
+        assert float(gradient[~dropped].abs().max()) > 0
 
 
 @pytest.mark.setting("loss.environment_weight")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import time
 from collections.abc import Callable
@@ -28,7 +27,7 @@ from ..params import EvaluateParams
 from ..progress import Reporter, shortened
 from ..project.fingerprints import Earlier, Fingerprint, compare, digest, files_digest, read_made, write_made
 from ..project.label_revision import is_made
-from ..project.runs import checkpoint_id, read_metrics, run_folder, state_id
+from ..project.runs import METRICS, checkpoint_id, read_metrics, run_folder, state_id
 from ..project.schema import step
 from ..project.store import load_project
 from ..render.baked import META, BakedField, load_baked, voxels_folder
@@ -46,6 +45,7 @@ from .report import check_report, write_report
 from .speed import SPEED_KEYS, measure_speed, peak_memory
 
 UNKNOWN_SIDE = 96  # pixels, see `Comparison._unknown`
+KEPT_AS = {"test": "test", "train": "train_photos"}  # splits in metrics.json, whose "train" is of the training
 
 
 @dataclass
@@ -258,9 +258,9 @@ def evaluate(params: EvaluateParams, report: Reporter) -> dict[str, Any]:
     rejected = sum(image.status == "rejected" for image in project.images)
     held_out = result["per_image"] if params.split == "test" else []
     result["advice"] = advice(scene, held_out, result["per_class_iou"], rejected)
-    path = run_folder(folder, params.run) / "metrics.json"
-    stored = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
-    write_json(path, {**stored, f"{params.split}_baked" if params.baked else params.split: result})
+    place = run_folder(folder, params.run)
+    kept_as = KEPT_AS[params.split] + ("_baked" if params.baked else "")
+    write_json(place / METRICS, {**read_metrics(place), kept_as: result})
     made = step("evaluate", params.model_dump(mode="json"), result, evaluation_inputs(params), state_id(trained.state))
     write_made(_record(params), made)
     if params.report is not None:

@@ -206,7 +206,7 @@ def cut_events(folder: Path) -> None:
 
 
 def read_metrics(folder: Path) -> dict[str, Any]:
-    """What was measured of a run: results of train ("train") and evaluate (by split); empty when nothing was."""
+    """What was measured of a run: results of train ("train") and evaluate ("test", "train_photos", …); empty when nothing was."""
     try:
         value = json.loads((folder / METRICS).read_text(encoding="utf-8"))
     except (OSError, ValueError):

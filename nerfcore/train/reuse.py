@@ -75,7 +75,7 @@ def _trained(params: TrainParams) -> Earlier:
         return Earlier(reason=error.message)
     project = load_project(folder)
     result = read_metrics(place).get("train") or {}
-    if result and "checkpoint" not in result:  # `evaluate --split train` has written there since
+    if result and "checkpoint" not in result:  # earlier versions of `evaluate --split train` wrote there
         steps = [s for s in project.provenance if s.verb == "train" and s.result.get("run") == params.run]
         result = steps[-1].result if steps else {}
     done = step("train", {}, result, info.origin.inputs)

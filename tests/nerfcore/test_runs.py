@@ -243,6 +243,17 @@ def test_a_run_of_another_project_is_neither_used_again_nor_gone_on_with(project
     assert unfinished(asked)
 
 
+def test_photos_of_training_that_are_evaluated_say_nothing_of_the_training(project: Path) -> None:
+    place, asked = run_folder(project, "main"), EvaluateParams(project=project, split="train", time_limit=1)
+    trained = runs.read_metrics(place)["train"]
+    found = evaluate(asked, Reporter())
+    assert runs.read_metrics(place)["train"] == trained, "by whose PSNR held-out photos are judged"
+    assert runs.read_metrics(place)["train_photos"]["psnr"] == found["psnr"]
+    (place / runs.METRICS).unlink()  # as a training that was stopped leaves it
+    evaluate(asked, Reporter())
+    assert unfinished(params(project)), "it goes on all the same"
+
+
 def test_a_field_that_is_not_the_one_its_training_ended_with_is_not_finished(project: Path) -> None:
     asked, checkpoint = params(project), run_folder(project, "main") / runs.CHECKPOINT
     assert finished(asked).result is not None

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
+from typing import Literal, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from .base import (
     CLASSES,
@@ -60,6 +60,13 @@ class ReconstructParams(Params):
     )
 
 
+def needs_cluster(cluster: str | None, **given: object) -> None:
+    """Raise ValueError where something is given that without a cluster would be left out silently."""
+    for name, value in given.items():
+        if cluster is None and value is not None:
+            raise ValueError(f"{name}: only workers of a cluster use it; say which cluster as well")
+
+
 class BatchParams(Params):
     list: Path = Field(description=".csv or .json file with one capture a row: the settings of reconstruct by name")
     retries: int = Field(default=1, ge=0, le=1000, description="how often a capture that failed is tried again")
@@ -84,6 +91,11 @@ class BatchParams(Params):
     dry_run: bool = Field(
         default=False, description="do nothing: say what there is to do, what is missing, and how long it may take"
     )
+
+    @model_validator(mode="after")
+    def _on_a_cluster(self) -> Self:
+        needs_cluster(self.cluster, storage=self.storage, wheel=self.wheel)
+        return self
 
 
 class BlocksParams(Params):
@@ -125,6 +137,11 @@ class BlocksParams(Params):
         le=1e6,
         description="with --cluster: a worker with fewer GB free on its disk gets nothing to do",
     )
+
+    @model_validator(mode="after")
+    def _on_a_cluster(self) -> Self:
+        needs_cluster(self.cluster, wheel=self.wheel)
+        return self
 
 
 class BenchParams(Params):

@@ -157,6 +157,13 @@ def test_what_excludes_each_other_is_refused(tmp_path: Path, capfd: pytest.Captu
         assert "give one of test, all, camera and orbit" in answer["error"]["message"]
 
 
+@pytest.mark.parametrize("words", [["batch", "list.csv", "--storage", "s3://x/y"], ["blocks", "p", "--wheel", "f.whl"]])
+def test_what_only_a_cluster_uses_is_not_left_out_silently(words: list[str], capfd: pytest.CaptureFixture[str]) -> None:
+    code, answer = command(capfd, *words)
+    assert (code, answer["error"]["code"]) == (2, "usage")
+    assert f"{words[2][2:]}: only workers of a cluster use it" in answer["error"]["message"]
+
+
 def test_defaults_are_shown_as_they_are_written(capfd: pytest.CaptureFixture[str]) -> None:
     assert main(["simulate", "--help"]) == 0
     assert "[default: 480x320]" in " ".join(capfd.readouterr().out.split())

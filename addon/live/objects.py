@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..errors import EngineError
 from ..roles import ROLE
 
 SOLID = {"MESH", "CURVE", "SURFACE", "META", "FONT"}
@@ -67,7 +68,14 @@ def is_holdout(instance: Any, view_layer: Any) -> bool:
 
 
 def write_triangles(path: Path, depsgraph: Any) -> Path:
-    """The same in a file for the engine."""
-    with open(path, "wb") as file:
-        np.savez(file, **triangles(depsgraph)._asdict())
+    """The same in a file for the engine. Raises EngineError: there is no room for it."""
+    found = triangles(depsgraph)._asdict()
+    try:
+        with open(path, "wb") as file:
+            np.savez(file, **found)
+    except OSError as error:
+        path.unlink(missing_ok=True)
+        raise EngineError(
+            "disk", f"There is no room for the scene's objects in {path.parent}: {error.strerror}.", "Free some memory."
+        ) from error
     return path

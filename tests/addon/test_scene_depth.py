@@ -10,6 +10,8 @@ import pytest
 pytest.importorskip("bpy")
 
 import bpy
+from fieldwork.addon.errors import EngineError
+from fieldwork.addon.live import objects
 from fieldwork.addon.live.objects import mesh_of
 from fieldwork.addon.live.scene_depth import UNUSED, SceneDepth, Shape, _covers, lacks_depth
 
@@ -51,6 +53,17 @@ def test_nothing_is_kept_that_no_viewport_asks_for() -> None:
     depth.give_up(30.0 + UNUSED)
     assert not depth._targets
     assert not depth._shapes
+
+
+def test_objects_for_which_there_is_no_room_are_told(tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(file, **_) -> None:
+        file.write(b"some of it")
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(objects.np, "savez", full)
+    with pytest.raises(EngineError, match="no room for the scene's objects"):
+        objects.write_triangles(tmp_path / "objects.npz", bpy.context.evaluated_depsgraph_get())
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_what_is_drawn_as_wires_hides_nothing() -> None:

@@ -7,6 +7,7 @@ whichever thread asks. No bpy here but where it says so.
 from __future__ import annotations
 
 import contextlib
+import errno
 import itertools
 import mmap
 import os
@@ -62,13 +63,15 @@ def folder_for_frames() -> Path:
 def make_room(file: Any, size: int) -> None:
     """Give an open file its size. Raises OSError: there is no room; of a file that is only said to be so large the system would
     end the process that writes it."""
+    file.truncate(size)
+    if not hasattr(os, "posix_fallocate"):
+        return
     try:
-        file.truncate(size)
-        if hasattr(os, "posix_fallocate"):
-            os.posix_fallocate(file.fileno(), 0, size)
-    except OSError:
-        file.truncate(0)
-        raise
+        os.posix_fallocate(file.fileno(), 0, size)
+    except OSError as error:
+        if error.errno in (errno.ENOSPC, errno.EDQUOT):  # else the file system only cannot tell
+            file.truncate(0)
+            raise
 
 
 def _lives(pid: int) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import subprocess
 import sys
@@ -10,6 +11,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from fieldwork.addon.errors import EngineError
 from fieldwork.addon.live import frames
 from fieldwork.addon.live.frames import Sizes, _SharedPixels
 from fieldwork.nerfcore.film.shared_file import SharedFile
@@ -135,6 +137,24 @@ def test_files_have_room_for_what_others_write(bpy_script, tmp_path: Path) -> No
         folder=tmp_path,
     )
     assert 512 * facts >= size
+
+
+@pytest.mark.parametrize(("number", "refused"), [(errno.ENOSPC, True), (errno.EDQUOT, True), (errno.EOPNOTSUPP, False)])
+def test_no_room_is_told_and_a_file_system_that_cannot_tell_is_used(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, number: int, refused: bool
+) -> None:
+    def fallocate(*_: int) -> None:
+        raise OSError(number, "No")
+
+    monkeypatch.setattr(frames.os, "posix_fallocate", fallocate, raising=False)
+    pixels = _SharedPixels(tmp_path / "frame", Sizes(3, 2, {"Combined": 4}))
+    if refused:
+        with pytest.raises(EngineError, match="no room for a frame"):
+            pixels.__enter__()
+        assert list(tmp_path.iterdir()) == []
+    else:
+        with pixels:
+            assert pixels.copy("Combined").shape == (2, 3, 4)
 
 
 def test_frames_are_on_the_disk_where_memory_has_no_room(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -51,11 +51,13 @@ class Frame(NamedTuple):
 
 def folder_for_frames() -> Path:
     """A new folder for this process's frames, in memory where that can be; folders of dead processes are removed."""
+    from ...nerfcore.engine.status import process_exists  # not at the top: enabling the extension must be quick
+
     memory = os.path.isdir(IN_MEMORY) and os.access(IN_MEMORY, os.W_OK) and shutil.disk_usage(IN_MEMORY).free > ROOM
     place = Path(IN_MEMORY if memory else tempfile.gettempdir())
     for other in place.glob(f"{PREFIX}*"):
         number = other.name.removeprefix(PREFIX).split("-")[0]
-        if number.isdecimal() and not _lives(int(number)):
+        if number.isdecimal() and not process_exists(int(number)):
             _remove(other)
     return Path(tempfile.mkdtemp(prefix=f"{PREFIX}{os.getpid()}-", dir=place))
 
@@ -72,18 +74,6 @@ def make_room(file: Any, size: int) -> None:
         if error.errno in (errno.ENOSPC, errno.EDQUOT):  # else the file system only cannot tell
             file.truncate(0)
             raise
-
-
-def _lives(pid: int) -> bool:
-    if os.name == "nt":
-        return True  # a signal would end it; Windows empties its temporary folder itself
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    except PermissionError:
-        return True
-    return True
 
 
 def _remove(folder: Path) -> None:

@@ -124,6 +124,30 @@ def test_what_is_being_written_is_not_shown(tmp_path: Path) -> None:
         assert pixels.whole("Normal") is None, "a pass that was not asked for"
 
 
+def test_folders_of_processes_that_are_gone_are_removed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    class Windows:
+        """`os` there, as far as it matters."""
+
+        name = "nt"
+
+        def __getattr__(self, name: str) -> object:
+            return getattr(os, name)
+
+    ended = subprocess.Popen([sys.executable, "-c", ""])
+    ended.wait()
+    monkeypatch.setattr(frames, "IN_MEMORY", str(tmp_path / "none"))
+    monkeypatch.setattr(frames.tempfile, "gettempdir", lambda: str(tmp_path))
+    for system in (os, Windows()):
+        monkeypatch.setattr(frames, "os", system)
+        left, own = (tmp_path / f"{frames.PREFIX}{number}-x" for number in (ended.pid, os.getpid()))
+        left.mkdir()
+        own.mkdir(exist_ok=True)
+        made = frames.folder_for_frames()
+        assert made.is_dir()
+        assert own.is_dir()
+        assert not left.exists(), system
+
+
 @pytest.mark.skipif(
     not hasattr(os, "posix_fallocate"), reason="the system has no holes in files, or no way to fill them"
 )

@@ -232,6 +232,11 @@ def test_photos_of_a_meshroom_rig_stand_where_its_cameras_do(tmp_path: Path, sai
     for name, (rotation, center) in expected.items():
         np.testing.assert_allclose(found[name][:3, :3], rotation, atol=1e-12)
         np.testing.assert_allclose(found[name][:3, 3], center, atol=1e-12)
+    rig["subPoses"][1]["status"] = "uninitialized"
+    (tmp_path / "cameras.sfm").write_text(json.dumps(value))
+    rest = read_dataset(tmp_path)
+    assert [view.name for view in rest.views] == ["10", "20", "30"]
+    assert rest.warnings[0].endswith("and were not imported: 11.png; 21.png.")
 
 
 def test_a_meshroom_file_with_numbers_for_photos_is_damaged(tmp_path: Path) -> None:

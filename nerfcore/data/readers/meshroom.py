@@ -25,6 +25,7 @@ from ...progress import shortened
 from ..dataset import Dataset, DatasetView, lens_at_size, not_imported, require
 
 RATIO_OF_PIXELS = [1, 2, 5]  # the version from which "pixelRatio" is that of pixels
+UNPLACED = "uninitialized"  # status of a camera of a rig of which nothing is known
 RADIAL = {"radial1": 1, "radial3": 3, "radialk1": 1, "radialk3": 3}
 
 
@@ -54,17 +55,14 @@ def read(folder: Path) -> Dataset:
         intrinsics = {entry["intrinsicId"]: entry for entry in value["intrinsics"]}
         poses = {entry["poseId"]: entry["pose"]["transform"] for entry in value.get("poses", [])}
         rigs = {entry["rigId"]: entry["subPoses"] for entry in value.get("rigs") or []}
-        placed = [view for view in value["views"] if view.get("poseId") in poses]
-        without = [_source(view).name for view in value["views"] if view.get("poseId") not in poses]
-        shared = Counter(view["poseId"] for view in placed)
+        shared = Counter(view.get("poseId") for view in value["views"])
+        views = [(view, _in_rig(view, rigs, shared[view.get("poseId")] > 1)) for view in value["views"]]
+        placed = [(v, rig) for v, rig in views if v.get("poseId") in poses and (rig or {}).get("status") != UNPLACED]
+        known = {view["viewId"] for view, _ in placed}
+        without = [_source(view).name for view, _ in views if view["viewId"] not in known]
         entries = [
-            (
-                _source(view),
-                intrinsics[view["intrinsicId"]],
-                poses[view["poseId"]],
-                _place_in_rig(view, rigs, shared[view["poseId"]] > 1),
-            )
-            for view in placed
+            (_source(view), intrinsics[view["intrinsicId"]], poses[view["poseId"]], rig and rig["pose"])
+            for view, rig in placed
         ]
     except (OSError, ValueError, LookupError, TypeError) as error:
         raise InputError(f"{path} is damaged: {error!r}.", "Export the cameras from Meshroom again.") from error
@@ -108,13 +106,13 @@ def _source(view: dict[str, Any]) -> Path:
     return Path(view["path"].replace("\\", "/"))
 
 
-def _place_in_rig(view: dict[str, Any], rigs: dict[Any, Any], shared: bool) -> dict[str, Any] | None:
-    """How the camera of a photo stands in the rig whose pose the photo has; None where that pose is its own: rigs of which
+def _in_rig(view: dict[str, Any], rigs: dict[Any, Any], shared: bool) -> dict[str, Any] | None:
+    """The entry for the camera of a photo in the rig whose pose the photo has; None where that pose is its own: rigs of which
     little was placed have photos of both kinds. `shared`: whether other photos have the same pose; older files say no more."""
     own = view.get("isPoseIndependant", "false" if shared else "true")
     if view.get("rigId") not in rigs or str(own).lower() == "true":
         return None
-    return rigs[view["rigId"]][int(view["subPoseId"])]["pose"]
+    return rigs[view["rigId"]][int(view["subPoseId"])]
 
 
 def _pose(transform: dict[str, Any]) -> np.ndarray:

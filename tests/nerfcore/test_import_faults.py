@@ -239,6 +239,20 @@ def test_photos_of_a_meshroom_rig_stand_where_its_cameras_do(tmp_path: Path, sai
     assert rest.warnings[0].endswith("and were not imported: 11.png; 21.png.")
 
 
+@pytest.mark.parametrize("count", [3, 2])
+def test_masks_of_dtu_that_are_not_used_are_told(tmp_path: Path, count: int) -> None:
+    """They belong to the photos in their order, which one that is missing would shift."""
+    projection = np.array([[50.0, 0, 20, 0], [0, 50, 15, 0], [0, 0, 1, 4], [0, 0, 0, 1]])
+    np.savez(tmp_path / "cameras.npz", **{f"world_mat_{i}": projection for i in range(3)})
+    for folder, names in (("image", 3), ("mask", count)):
+        (tmp_path / folder).mkdir()
+        for i in range(names):
+            Image.new("RGB", (40, 30), (255, 255, 255)).save(tmp_path / folder / f"{i:03d}.png")
+    dataset = read_dataset(tmp_path)
+    assert all((view.mask is not None) == (count == 3) for view in dataset.views)
+    assert any("2 masks for 3 photos" in text for text in dataset.warnings) == (count == 2)
+
+
 def test_a_meshroom_file_with_numbers_for_photos_is_damaged(tmp_path: Path) -> None:
     value = {"views": [{"viewId": "1"}, 3], "intrinsics": [], "poses": []}
     (tmp_path / "cameras.sfm").write_text(json.dumps(value))

@@ -41,7 +41,11 @@ def read(folder: Path) -> Dataset:
     count = sum(name.startswith("world_mat_") and "inv" not in name for name in matrices)
     if len(images) != count:
         raise InputError(f"{folder} has {len(images)} images, but {path.name} has {count} cameras.", "Complete it.")
-    views = []
+    views, warnings = [], []
+    if masks and len(masks) != len(images):
+        warnings.append(
+            f"{folder} has {len(masks)} masks for {len(images)} photos: none is used, as they go by their order."
+        )
     for i, image in enumerate(images):
         if f"world_mat_{i}" not in matrices:
             raise InputError(f"{path} has no world_mat_{i}.", "Download the data set again.")
@@ -57,4 +61,4 @@ def read(folder: Path) -> Dataset:
         sphere = frame @ matrices["scale_mat_0"]
         corners = transform_points(sphere, np.stack(np.meshgrid(*[[-1.0, 1.0]] * 3), -1).reshape(-1, 3))
         bounds = np.stack([corners.min(0), corners.max(0)])
-    return Dataset(format="dtu", views=views, world_from_sfm=frame, up_confidence=confidence, bounds=bounds)
+    return Dataset("dtu", views, frame, confidence, bounds=bounds, warnings=warnings)

@@ -72,9 +72,9 @@ def _passes(
         vertices, faces, patch = _one_pass(
             vertices, faces, patch, ratio, number, size, True, not move_borders, step, report
         )
-        if not move_borders:
+        if not move_borders and size > SMALL_CHUNK:
             size = SMALL_CHUNK  # a chunk that simplifying would fold was left as it is
-        if len(faces) > STALLED * before:
+        elif len(faces) > STALLED * before:
             break
     if move_borders and target < len(faces) <= WHOLE:  # nothing but borders is left
         ratio = target / len(faces)

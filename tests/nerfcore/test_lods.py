@@ -126,6 +126,24 @@ def test_collapses_that_fold_an_edge_are_taken_back(monkeypatch: pytest.MonkeyPa
     assert (patch == 2).sum() < 0.5 * (full.face_class == 2).sum()
 
 
+def test_where_all_large_chunks_fold_smaller_ones_are_simplified(monkeypatch: pytest.MonkeyPatch) -> None:
+    full = ball()
+    real = decimation.fast_simplification.simplify
+
+    def folding(points: np.ndarray, triangles: np.ndarray, **how):
+        large = len(triangles) > decimation.SMALL_CHUNK
+        points, triangles, *_ = real(points, triangles, **how)
+        if large:
+            fin = [*triangles[0, :2], len(points)]
+            points, triangles = np.vstack([points, points[0] + 1]), np.vstack([triangles, fin])
+        return points, triangles
+
+    monkeypatch.setattr(decimation.fast_simplification, "simplify", folding)
+    faces = make_levels(full, None, 1, Reporter())[0].surface.faces
+    assert is_watertight(faces)
+    assert len(faces) < 0.4 * len(full.faces)
+
+
 def test_a_level_has_the_texture_of_the_full_surface(tmp_path: Path) -> None:
     full = ball()
     # One texel row of the texture for each height, by a plain projection.

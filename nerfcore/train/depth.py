@@ -70,16 +70,16 @@ def find_depths(
     points = transform_points(box_from_world, scene.points.xyz)
     trust = point_trust(scene.points.error)
     poses = store.rays.rotation.cpu().double().numpy(), store.rays.center.cpu().double().numpy()
-    alpha = store.rgba[:, 3].cpu().numpy() > 127
-    usable = np.ones(len(store), bool)
+    counted = store.rgba[:, 3].cpu().numpy() > 127
     if store.usable is not None:
-        usable[:] = False
+        usable = np.zeros(len(store), bool)
         usable[store.usable.cpu().numpy()] = True
+        counted &= usable
     parts: list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]] = []
     for index, (view, camera) in enumerate(zip(store.views, store.cameras)):
         rotation, center = poses[0][index], poses[1][index]
         first = int(store.first[index])
-        free = (alpha & usable)[first : first + camera.width * camera.height].reshape(camera.height, camera.width)
+        free = counted[first : first + camera.width * camera.height].reshape(camera.height, camera.width)
         for direction, distance, weight in (
             _of_points(points, trust, visibility.get(view.name), camera, rotation, center, free),
             _of_map(view, camera, scale, free),

@@ -85,8 +85,9 @@ def _unseen(scores: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def _gaps(scene: Scene) -> list[str]:
-    """The widest gaps between neighbours, where cameras go around something (z is up)."""
-    views = [scene.views[i] for i in scene.train]
+    """The widest gaps between neighbours, where cameras go around something (z is up); also photos that are held out were
+    taken."""
+    views = scene.views
     if len(views) < 4 or not looks_inward(views):
         return []
     focus = focus_point([view.camera_to_world for view in views])

@@ -50,12 +50,18 @@ def test_what_no_photo_looked_at_is_told(scene: Scene) -> None:
 
 def test_a_gap_in_the_ring_is_told_and_one_side_alone_is_not(scene: Scene) -> None:
     def trained_on(kept: list[int]) -> Scene:
-        return replace(scene, train=kept, test=[])
+        return replace(scene, views=[scene.views[i] for i in kept], train=list(range(len(kept))), test=[])
 
     (text, few) = advice(trained_on([i for i in range(24) if i not in (5, 6, 7, 8)]), [], {}) + [""]
     assert "Between 04 and 09 nobody photographed for 75° around" in text
     assert few == ""
     assert not any("Between" in line for line in advice(trained_on(list(range(8))), [], {}))
+
+
+def test_a_photo_that_is_held_out_leaves_no_gap(scene: Scene) -> None:
+    """12 photos all around, 30° apart: without those held out there would be 60°."""
+    sparse = replace(scene, views=scene.views[::2], train=[i for i in range(12) if i % 8], test=[0, 8])
+    assert not any("nobody photographed" in line for line in advice(sparse, [], {}))
 
 
 def test_few_or_rejected_photos_and_wrong_classes_are_told(scene: Scene) -> None:

@@ -17,6 +17,7 @@ BLUR_SHARE = 0.1  # of the median sharpness of a camera's photos, below which on
 MIN_PHOTOS_TO_JUDGE = 8  # of a camera
 FOCUS_SHARE = 0.3  # of the median focus of photos of the camera that are not doubtful
 COMPARED = 8  # of those at most: each is decoded once more
+TWIN = "the same picture as"  # begins the reason of a photo that another one makes needless
 
 
 def reject_duplicates(
@@ -38,7 +39,7 @@ def reject_duplicates(
             near = sorted(number for _, number in by_brightness[low:high])
             twin = next((kept[number] for number in near if _same(kept[number], record, pictures)), None)
         if twin is not None:
-            record.status, record.reason = "rejected", f"the same picture as {Path(twin.source).name}"
+            record.status, record.reason = "rejected", f"{TWIN} {Path(twin.source).name}"
         else:
             first_with[record.sha256] = record
             bisect.insort(by_brightness, (mean, len(kept)))

@@ -29,7 +29,7 @@ def advice(
     Args:
         scores: of each held-out photo "name", "psnr" and, where it is known, "unknown": share of its rays' ways that no
             training photo shows.
-        rejected: photos of the capture that were left out, blurred ones for instance.
+        rejected: photos of the capture that were left out, blurred ones for instance; not second copies of others.
     """
     views = {view.name: view for view in scene.views}
     told = [*_bad_places(scores, views, [scene.views[i] for i in scene.train]), *_unseen(scores), *_gaps(scene)]

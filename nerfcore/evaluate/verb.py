@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from ..capture.select import TWIN
 from ..data.box import box_poses
 from ..data.load import class_inputs, load_scene, view_inputs
 from ..data.photo import photo_of
@@ -255,7 +256,7 @@ def evaluate(params: EvaluateParams, report: Reporter) -> dict[str, Any]:
     result["verdict"] = evaluate_verdict(result, psnr_train, opaque, bool(compared.confusion.class_ids), environment)
     if params.baked:
         result["lost"] = _lost(params, result)
-    rejected = sum(image.status == "rejected" for image in project.images)
+    rejected = sum(image.status == "rejected" and not image.reason.startswith(TWIN) for image in project.images)
     held_out = result["per_image"] if params.split == "test" else []
     result["advice"] = advice(scene, held_out, result["per_class_iou"], rejected)
     place = run_folder(folder, params.run)

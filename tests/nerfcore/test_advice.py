@@ -8,12 +8,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from fieldwork.nerfcore.capture.select import TWIN
 from fieldwork.nerfcore.data.load import load_scene
 from fieldwork.nerfcore.data.scene import Scene
 from fieldwork.nerfcore.errors import SettingError
 from fieldwork.nerfcore.evaluate.advice import advice
 from fieldwork.nerfcore.params import EvaluateParams, TrainParams
 from fieldwork.nerfcore.progress import Reporter
+from fieldwork.nerfcore.project.schema import ImageRecord
+from fieldwork.nerfcore.project.store import edit_project
 from fieldwork.nerfcore.verbs import run_verb
 from fieldwork.tests.nerfcore.support.ball import SMALL, ball_project
 
@@ -94,3 +97,10 @@ def test_evaluate_writes_a_report_that_judges_the_capture(tmp_path: Path) -> Non
     assert len(names) == 14
     assert names == sorted(names)
     assert [Path(picture).stem for picture in result["pictures"]] == [Path(name).stem for name in names]
+    # Nobody has to take a photo again of which there is a second copy.
+    with edit_project(project) as edited:
+        edited.images += [ImageRecord(name=f"copy {i}", status="rejected", reason=TWIN) for i in range(9)]
+    assert not any("were left out" in line for line in run_verb("evaluate", params, Reporter())["advice"])
+    with edit_project(project) as edited:
+        edited.images += [ImageRecord(name=f"x {i}", status="rejected", reason="blurred") for i in range(9)]
+    assert any(line.startswith("9 photos were left") for line in run_verb("evaluate", params, Reporter())["advice"])

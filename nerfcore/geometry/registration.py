@@ -54,8 +54,9 @@ def by_points(path: Path, with_scale: bool) -> Registered:
     except (OSError, UnicodeDecodeError, csv.Error, KeyError, TypeError, ValueError) as error:
         raise InputError(f"The common points {path} cannot be read: {error}.", HINT) from error
     here, there = np.array(rows, np.float64).reshape(-1, 2, 3).transpose(1, 0, 2)
-    spread = np.linalg.svd(there - there.mean(0), compute_uv=False) if len(there) >= 3 else np.zeros(3)
-    if len(there) < 3 or spread[1] <= 1e-6 * spread[0] or not np.isfinite(there + here).all():
+    usable = len(there) >= 3 and np.isfinite([here, there]).all()
+    spread = np.linalg.svd(there - there.mean(0), compute_uv=False) if usable else np.zeros(3)
+    if spread[1] <= 1e-6 * spread[0]:
         raise InputError(f"The common points {path} do not say how the epochs lie to each other.", HINT)
     transform = fit_similarity(there, here, with_scale)
     left = transform_points(transform, there) - here

@@ -186,6 +186,18 @@ def test_common_points_register(tmp_path: Path) -> None:
             by_points(path, False)
 
 
+@pytest.mark.parametrize("cell", ["nan", "inf"])
+@pytest.mark.parametrize("column", [0, 5])
+def test_common_points_with_cells_that_say_nothing_are_refused(tmp_path: Path, cell: str, column: int) -> None:
+    """As tables have them where a value is missing."""
+    rows = [["0", "0", "0", "0", "0", "0"], ["1", "0", "0", "1", "0", "0"], ["0", "1", "0", "0", "1", "0"]]
+    rows[1][column] = cell
+    lines = ["name,x,y,z,other_x,other_y,other_z", *(f"p{i}," + ",".join(row) for i, row in enumerate(rows))]
+    (tmp_path / "points.csv").write_text("\n".join(lines))
+    with pytest.raises(InputError, match="do not say how the epochs lie"):
+        by_points(tmp_path / "points.csv", False)
+
+
 def test_things_that_have_nothing_in_common_are_not_compared(tmp_path: Path) -> None:
     now, before = epoch(tmp_path / "now", np.eye(4), 0), epoch(tmp_path / "before", np.eye(4), 1)
     path = tmp_path / "points.csv"

@@ -13,7 +13,8 @@ from ..cluster import status as st
 from ..cluster.estimate import Durations
 from ..cluster.link import Link
 from ..cluster.run import Options, Progress, Runner
-from ..cluster.storage import Copy, Storage
+from ..cluster.storage import Storage
+from ..cluster.working_copy import Copy
 from ..cluster.tasks import Need, Task
 from ..config import make_config
 from ..errors import Cancelled, SettingError, explained

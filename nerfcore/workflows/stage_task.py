@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from ..capture.find import classes_beside, subfolder
-from ..cluster.storage import Copy, Saving, Storage, placed, work_folder
+from ..cluster.storage import Storage, work_folder
+from ..cluster.working_copy import Copy, Saving, placed
 from ..cluster.worker import require_inside
 from ..params import PosesParams, ReconstructParams, RenderParams
 from ..poses.spread import find_features, match_part

@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 import pytest
 from fieldwork.nerfcore.cluster import storage as module
-from fieldwork.nerfcore.cluster.storage import Copy, Saving, Storage, StorageError, placed
+from fieldwork.nerfcore.cluster.storage import Storage, StorageError
 from fieldwork.nerfcore.cluster.worker import Refusal
+from fieldwork.nerfcore.cluster.working_copy import Copy, Saving, placed
 from fieldwork.nerfcore.errors import FieldworkError, SettingError
 from fieldwork.nerfcore.files import atomic_path
 from fieldwork.nerfcore.params import ReconstructParams

@@ -45,7 +45,9 @@ class Features:
         """Indices of the faces of each object by its name, for `split` "none", "classes" or "instances"."""
         if split == "none":
             return {"mesh": np.arange(len(self.face))}
-        names = np.array([row.class_name if split == "classes" else row.name for row in self.rows], object)
+        called = {row.name for row in self.rows if row.instance}  # a thing may be called as a class is by now
+        rest = [f"{row.name}.000" if not row.instance and row.name in called else row.name for row in self.rows]
+        names = np.array([row.class_name for row in self.rows] if split == "classes" else rest, object)
         return {str(name): np.flatnonzero((names == name)[self.face]) for name in dict.fromkeys(names)}
 
 

@@ -13,6 +13,7 @@ import trimesh
 from fieldwork.nerfcore.data.scene import ClassInfo
 from fieldwork.nerfcore.mesh.features import features_of
 from fieldwork.nerfcore.mesh.files import write_surface
+from fieldwork.nerfcore.mesh.instances import Instance
 from fieldwork.nerfcore.mesh.parts import texture_of
 from fieldwork.nerfcore.mesh.surface import Surface, class_table
 from PIL import Image
@@ -134,6 +135,19 @@ def test_split_obj_keeps_the_textures_of_its_parts(tmp_path: Path) -> None:
         if path.suffix == ".png":
             with Image.open(path) as image:
                 assert image.getpixel((7, 7)) == (50, 50, 50)
+
+
+def test_a_thing_that_is_called_as_a_class_is_not_one_with_the_rest_of_that(tmp_path: Path) -> None:
+    surface = replace(square(), face_instance=np.array([1, 0], np.uint32))
+    classes = [ClassInfo(1, "chair", (0, 0, 0)), ClassInfo(2, "table", (0, 0, 0))]
+    features = features_of(surface, classes, 0, [Instance(1, "table", 1, 0.5, (0, 0, 0))])
+    assert {name: faces.tolist() for name, faces in features.groups("instances").items()} == {
+        "table": [0],
+        "table.000": [1],
+    }
+    assert list(features.groups("classes")) == ["chair", "table"]
+    write_surface(tmp_path / "a.glb", surface, features, "instances")
+    assert [mesh["name"] for mesh in glb(tmp_path / "a.glb")[0]["meshes"]] == ["table", "table.000"]
 
 
 def test_areas_of_void_and_of_a_class_of_its_name_are_added() -> None:

@@ -100,9 +100,9 @@ def view_picture(
     def tile(rows: torch.Tensor) -> torch.Tensor:
         check()
         o, d = origins[rows], directions[rows]
-        begin = torch.zeros(len(rows), device=placed.device)
-        own = (x.float().to(placed.device) for x in (o, d))
-        seen = placed.rays(*own, begin, lengths[rows].float().to(placed.device))
+        begin = torch.zeros(len(rows))
+        origin, direction, first, last = (x.float().to(placed.device) for x in (o, d, begin, lengths[rows]))
+        seen = placed.rays(origin, direction, first, last)
         # Depths on the host: Apple's GPUs have no float64.
         point = o + d * seen.distance.cpu().double()[:, None]
         place = torch.cat([point, torch.ones_like(point[:, :1])], 1) @ clip.T

@@ -67,7 +67,7 @@ class RenderParams(Params):
     size: PictureSize | None = Field(
         default=None, description="WxH; cut where a camera has other proportions (held-out and all photos: resampled)"
     )
-    passes: list[Pass] = Field(default=["rgb", "depth", "semantic"], description="what to render")
+    passes: list[Pass] = Field(default=["rgb", "depth", "semantic"], min_length=1, description="what to render")
     baked: bool = Field(default=False, description="from the baked field, which is faster, instead of the field")
     edits: Path | None = Field(
         default=None,

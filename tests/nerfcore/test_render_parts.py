@@ -118,6 +118,8 @@ def test_wrong_ranges_are_told(place, tmp_path):
     for frames in ((3, 2), (-1, 2)):
         with pytest.raises(ValidationError, match="no range of frames"):
             asked(place, tmp_path, frames)
+    with pytest.raises(ValidationError, match="at least 1 item"):
+        RenderParams(project=place, out=tmp_path, orbit=1, passes=[])
 
 
 def test_a_long_render_of_a_campaign_is_spread_over_workers(place, monkeypatch):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
+from functools import partial
 
 import numpy as np
 import scipy
@@ -91,11 +91,12 @@ def spread_views(views: list[View], most: int) -> list[View]:
 def map_size(views: list[View], device: torch.device) -> int:
     """Longest side of the depth maps, so that all together stay affordable."""
     most = CPU_PIXELS if device.type == "cpu" else GPU_PIXELS
-    total = sum(_flat_pixels(view.camera.resized(*training_size(view.camera, SIDE))) for view in views)
+    cameras = [view.camera.resized(*training_size(view.camera, SIDE)) for view in views]
+    pixels = {camera: _flat_pixels(camera) for camera in dict.fromkeys(cameras)}
+    total = sum(pixels[camera] for camera in cameras)
     return max(64, int(SIDE * min(1.0, (most / total) ** 0.5)))
 
 
-@lru_cache(maxsize=256)
 def _flat_pixels(camera: Camera) -> float:
     """Pixels of the flat pictures that show what a camera does, as small ones tell."""
     if camera.model in FLAT:

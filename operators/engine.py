@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -22,7 +23,7 @@ def options() -> Options:
     from ..addon.engine import install  # not at the top: enabling the extension must be quick
 
     chosen = machine.preferences()
-    base, wheels = bpy.path.abspath(chosen.base_python), bpy.path.abspath(chosen.wheels)
+    base, wheels = (os.path.expanduser(bpy.path.abspath(path)) for path in (chosen.base_python, chosen.wheels))
     return install.Options(
         folder=machine.engine_folder(),
         base=Path(base) if base else install.default_base(),

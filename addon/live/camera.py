@@ -57,7 +57,9 @@ def _fitted(data: bpy.types.Camera, width: int, height: int, aspect: Sequence[fl
 
 
 def _panorama(data: bpy.types.Camera, width: int, height: int) -> dict[str, Any]:
-    own = data if hasattr(data, "panorama_type") else data.cycles  # Blender 5 moved it out of Cycles
+    own = data if hasattr(data, "panorama_type") else getattr(data, "cycles", None)  # Blender 5 moved it out of Cycles
+    if own is None:
+        raise SceneError(t("“{}” is a panorama of Cycles: enable that in the preferences.", data.name))
     if own.panorama_type not in PANORAMAS:
         raise SceneError(
             t(

@@ -121,7 +121,8 @@ def _from_colors(rgba: np.ndarray, colors: Colors | None, ignore_id: int, name: 
 
 def read_mask(path: Path) -> np.ndarray:
     """Foreground mask (H, W) bool: alpha where the file has one, else brightness above one half; of 65535 where a file goes
-    beyond 255, of 1 where it does not go beyond that. Grey files whose alpha is full everywhere have no alpha.
+    beyond 255, of 1 where it does not go beyond that; that of the brightest channel where a mask is painted in a colour. Grey
+    files whose alpha is full everywhere have no alpha.
 
     Raises:
         InputError: it is no image. One clause, fit as a reason.
@@ -133,7 +134,7 @@ def read_mask(path: Path) -> np.ndarray:
                 brightest = values.max(initial=0)
                 return values > (0.5 if brightest <= 1 else 127 if brightest <= 255 else 32767)
             if image.mode not in ("RGBA", "LA"):
-                return np.asarray(image.convert("L")) > 127
+                return np.asarray(image.convert("RGB")).max(-1) > 127
             pixels = np.asarray(image.convert("RGBA"))
             # Many programs save black and white with an alpha channel that says nothing.
             drawn = pixels[..., 3].min() == 255 and bool((pixels[..., :3] == pixels[..., :1]).all())

@@ -14,8 +14,8 @@ from ..cluster.estimate import Durations
 from ..cluster.link import Link
 from ..cluster.run import Options, Progress, Runner
 from ..cluster.storage import Storage
-from ..cluster.working_copy import Copy
 from ..cluster.tasks import Need, Task
+from ..cluster.working_copy import Copy
 from ..config import make_config
 from ..errors import Cancelled, SettingError, explained
 from ..evaluate.report import check_report

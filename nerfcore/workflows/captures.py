@@ -79,8 +79,10 @@ def _priority(value: Any, path: Path, number: int) -> int:
 def _rows(path: Path) -> list[dict[str, Any]]:
     try:
         text = path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path} cannot be read: {error}.", "Give a .csv or .json file.") from error
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {error.strerror}.", "Give a .csv or .json file.") from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path} is no text in UTF-8: {error}.", "Save it as UTF-8.") from error
     if path.suffix.lower() == ".csv":
         rows = list(csv.DictReader(text.splitlines()))
         if any(None in row for row in rows):

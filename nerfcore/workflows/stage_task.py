@@ -9,8 +9,8 @@ from typing import Any
 
 from ..capture.find import classes_beside, subfolder
 from ..cluster.storage import Storage, work_folder
-from ..cluster.working_copy import Copy, Saving, placed
 from ..cluster.worker import require_inside
+from ..cluster.working_copy import Copy, Saving, placed
 from ..params import PosesParams, ReconstructParams, RenderParams
 from ..poses.spread import find_features, match_part
 from ..progress import Reporter

@@ -177,6 +177,17 @@ def test_masks_drawn_in_black_and_white_or_by_alpha(tmp_path: Path, mode: str) -
     assert np.array_equal(read_mask(tmp_path / "m.png"), inside > 0)
 
 
+@pytest.mark.parametrize("color", [(255, 0, 0), (0, 0, 255), (128, 0, 0)])  # the last: the first of VOC's palette
+@pytest.mark.parametrize("mode", ["RGB", "P"])
+def test_masks_painted_in_a_colour(tmp_path: Path, color: tuple[int, int, int], mode: str) -> None:
+    inside = np.zeros((20, 30), np.uint8)
+    inside[5:15] = 1
+    image = Image.fromarray(inside, "P")
+    image.putpalette([0, 0, 0, *color])
+    image.convert(mode).save(tmp_path / "m.png")
+    assert np.array_equal(read_mask(tmp_path / "m.png"), inside > 0)
+
+
 @pytest.mark.parametrize(
     ("kind", "white"), [("uint8", 1), ("uint16", 1), ("uint16", 255), ("uint16", 65535), ("float32", 1)]
 )

@@ -62,7 +62,8 @@ def _refusing(call: Callable[..., None]) -> Callable[..., None]:
 
 def _open_below(path: Any) -> str | None:
     """A file that this process has open at `path` or in it, or mapped."""
-    wanted = os.path.realpath(os.fsdecode(path))
+    folder, name = os.path.split(os.fsdecode(path))
+    wanted = os.path.join(os.path.realpath(folder), name)  # a link itself, not what it leads to
     for held in _open_and_mapped():
         if held == wanted or held.startswith(wanted + os.sep):
             return held

@@ -157,9 +157,8 @@ def mesh_verdict(
     """Of `mesh`.
 
     Args:
-        hit: share of the photos' pixels that show it; None where a region was asked for, which may be little of what photos
-            show. solid, holes, overlapped, few: shares as `mesh.coverage.Coverage` has
-            them.
+        hit: share of the photos' pixels that show it; None where `solid` says how much of the region is there.
+        solid, holes, overlapped, few: shares as `mesh.coverage.Coverage` has them.
         largest: share of the area that its largest connected part has. guessed: share of it that closes gaps; None: nobody
             asked for that. denied: share of the area that was left out, as photos disagree on it.
     """

@@ -97,7 +97,7 @@ class FIELDWORK_OT_engine_remove(Operator):
         folder = machine.engine_folder()
         if queue.installing:
             cls.poll_message_set(t("The installation is under way"))
-        elif not any((folder / name).exists() for name in (*place.ENVIRONMENTS, "cache")):
+        elif not any((folder / name).exists() for name in (*place.ENVIRONMENTS, *place.DOWNLOADS)):
             cls.poll_message_set(t("There is no engine to remove"))
         else:
             return True

@@ -149,5 +149,5 @@ def in_short(count: int) -> str:
 
 
 def live(context: Context) -> State:
-    count = len(fields.field_objects(context.scene.objects))
+    count = len({part.field for part in fields.all_parts(context.scene)})
     return State(count > 0, str(count) if count else "")

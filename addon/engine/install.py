@@ -19,6 +19,7 @@ from .link import Link
 from .only_one import forget, only_one
 from .place import (
     COMPLETE,
+    DOWNLOADS,
     ENVIRONMENTS,
     LOCK,
     LOG,
@@ -53,11 +54,11 @@ def remove(folder: Path) -> None:
     with only_one(folder):
         for name in (COMPLETE, STAGING):
             (folder / name).unlink(missing_ok=True)
-        places = [folder / name for name in (*ENVIRONMENTS, "tools", "cache")]
+        places = [folder / name for name in (*ENVIRONMENTS, *DOWNLOADS)]
         for place in places:
             shutil.rmtree(place, ignore_errors=True)
         for place in places:
-            if place.exists():
+            if place.exists() and not place.is_symlink():
                 raise InstallError(f"{place} is in use. Close other Blenders, then press Remove again.")
 
 

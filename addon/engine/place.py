@@ -24,6 +24,7 @@ ENVIRONMENT = "FIELDWORK_ENGINE_PYTHON"
 COMPLETE = "complete.json"
 STAGING = "staging.json"
 ENVIRONMENTS = ("venv", "venv-2")
+DOWNLOADS = ("tools", "cache")
 LOG = "install.log"
 LOCK = Path(__file__).with_name("engine.lock")
 

@@ -268,11 +268,12 @@ class Queue:
             self.finish(job, None, error)
 
     def _engine(self) -> Link:
-        if self.link is not None and not self.link.alive:
+        link = self.link
+        if link is not None and not link.alive:
             # It may have died this moment: whoever waits for it is told before another one takes its place.
-            while self.link.process is not None and self.link.pump(LAST_WORDS):
+            while link.process is not None and link.pump(LAST_WORDS):
                 continue
-            if not self.link.alive:
+            if self.link is link and not link.alive:
                 self.link = None
         if self.link is None:
             self.link = open_link(self.engine_python(), machine.engine_log())

@@ -77,23 +77,23 @@ def parts(objects: Iterable[bpy.types.Object], is_shown: Is, is_hidden: Is, know
         found += [Part(field, copy) for copy in placed]
     for empty in empties:
         collection = empty.instance_collection if empty.instance_type == "COLLECTION" else None
-        if collection is not None and is_shown(empty):
-            if collection not in known:
-                known[collection] = []  # one that holds an instance of itself shows nothing more by it
-                inside = shown_inside(collection, is_hidden)
-                known[collection] = parts(inside, lambda _: True, is_hidden, known)
+        if collection is None:
+            continue
+        if collection not in known:
+            known[collection] = []  # one that holds an instance of itself shows nothing more by it
+            inside = shown_inside(collection, is_hidden)
+            known[collection] = parts(collection.all_objects, inside.__contains__, is_hidden, known)
+        if known[collection] and is_shown(empty):
             found += [part._replace(instancers=(empty, *part.instancers)) for part in known[collection]]
     return found
 
 
-def shown_inside(collection: bpy.types.Collection, is_hidden: Is) -> list[bpy.types.Object]:
+def shown_inside(collection: bpy.types.Collection, is_hidden: Is) -> set[bpy.types.Object]:
     """The objects that an instance of a collection shows."""
     if is_hidden(collection):
-        return []
-    found = {obj: None for obj in collection.objects if not is_hidden(obj)}
-    for child in collection.children:
-        found |= dict.fromkeys(shown_inside(child, is_hidden))
-    return list(found)
+        return set()
+    own = {obj for obj in collection.objects if not is_hidden(obj)}
+    return own.union(*(shown_inside(child, is_hidden) for child in collection.children))
 
 
 def seen_parts(layer: bpy.types.ViewLayer, space: bpy.types.SpaceView3D) -> list[Part]:
@@ -138,8 +138,8 @@ def rendered_items(depsgraph: bpy.types.Depsgraph) -> list[dict[str, Any]]:
     if not known:
         return [project_item(depsgraph.scene_eval, baked)]
     items = [_rendered_item(part, baked, depsgraph) for part in rendered_parts(depsgraph)]
-    others = [other for other in scene.view_layers if other.use and other != layer]
-    elsewhere = any(part.of_scene in set(other.objects) for other in others for part in known)
+    others = {obj for other in scene.view_layers if other.use and other != layer for obj in other.objects}
+    elsewhere = any(part.of_scene in others for part in known)
     animated = any(obj.animation_data for part in known for obj in (part.field, *part.instancers))
     if not items and not elsewhere and not animated:
         raise SceneError(t("All fields of the scene are hidden in renders."))
@@ -218,8 +218,12 @@ def project_item(scene: bpy.types.Scene, baked: bool) -> dict[str, Any]:
 
 def crop_box(own: Any) -> bpy.types.Object | None:
     """The box that a field object is cut to; None where it has none."""
+    if own.crop is None:
+        return None
     # A deleted object lives on as long as something points to it; one in a collection of instances is in no scene.
-    return own.crop if own.crop is not None and own.crop.original.users_collection else None
+    box = own.crop.original
+    there = box.users_scene or any(held.users > held.use_fake_user for held in box.users_collection)
+    return own.crop if there else None
 
 
 def crop_matrix(crop: bpy.types.Object) -> Matrix:

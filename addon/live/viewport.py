@@ -97,7 +97,7 @@ class Viewport:
         self._lay: Any = None
         self._batches: list[Any] = []
         self.error = ""
-        self._again = 0.0  # when to try again after an error
+        self._again: dict[int, float] = {}  # when views that could not be drawn try again, by region
         self._ended = 0.0  # when the last redraw was done here
         self._rest = 0.0  # seconds that a redraw takes beside what is done here
         self._waited = 0.0  # seconds of this redraw in which the card did what was asked of it before
@@ -105,14 +105,17 @@ class Viewport:
 
     def draw(self, context: bpy.types.Context, shown: list[fields.Part]) -> None:
         """Draw the fields of a view; what goes wrong is told in the panel, not in each redraw."""
-        if self.error and time.monotonic() < self._again:
+        key = context.region.as_pointer()
+        if time.monotonic() < self._again.get(key, 0.0):
             return
         try:
             self._draw(context, context.region, context.region_data, shown)
-            self.error = ""
+            self._again.pop(key, None)
+            self.error = self.error if self._again else ""
         except Exception as error:  # noqa: BLE001 - a handler that raises in each redraw would fill the terminal
             self.error = f"{type(error).__name__}: {error}"
-            self._again = time.monotonic() + RETRY
+            self._again = {view: when for view, when in self._again.items() if when > time.monotonic() - RETRY}
+            self._again[key] = time.monotonic() + RETRY
 
     def _draw(self, context: Any, region: Any, view3d: Any, shown: list[fields.Part]) -> None:
         begin = time.perf_counter()

@@ -266,6 +266,8 @@ def _indexed(scene: bpy.types.Scene, source: LabelSource) -> Iterator[None]:
     items: list[tuple[Any, int]] = []
     if source == "collection":
         number = {o: ids[c.name] for c in scene.collection.children for o in _members(c)}
+        # Where an object lies itself counts before where it is instanced.
+        number |= {o: ids[c.name] for c in scene.collection.children for o in c.all_objects}
         items = [(o, number.get(o, 0)) for o in bpy.data.objects]
     elif source in {"material", "object"}:
         found = _items(scene, source)

@@ -95,6 +95,9 @@ _before: list[Stored] = []  # paths of the open file, while it is saved elsewher
 @bpy.app.handlers.persistent
 def _saving(file: str, *_: Any) -> None:
     folder = os.path.dirname(file)
+    for obj in bpy.data.objects:
+        if obj.type == "EMPTY" and is_local(obj) and obj.fieldwork.folder:
+            obj.fieldwork.folder = ""  # files do not tell where they lay
     _before.clear()
     if bpy.data.filepath and folder != os.path.dirname(bpy.data.filepath):
         _before.extend(rewrite([*bpy.data.scenes, *bpy.data.objects], folder))
@@ -105,6 +108,7 @@ def _saved(file: str, *_: Any) -> None:
     if file != bpy.data.filepath:  # a copy, or nothing: the open file stays where it is
         _store(_before)
     _before.clear()
+    note(bpy.data.objects)
 
 
 @bpy.app.handlers.persistent

@@ -94,6 +94,7 @@ def import_steps(
     place = Held(bpy.data.scenes, scene)
     package, pieces = yield from _in_thread(read)
     owned = Owned(place(), Owner(package.name, package.uuid))
+    owned.classes = {entry["name"] for entry in package.classes}
     _parent(owned, package)
     owned.release_copies()
     size, clip = display_size(package), clip_range(package)

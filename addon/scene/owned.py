@@ -28,6 +28,7 @@ class Owned:
     def __init__(self, scene: bpy.types.Scene, owner: Owner) -> None:
         self.owner = owner
         self.used: set[str] = set()
+        self.classes: set[str] = set()  # names of the classes that there are
         self.kept: list[str] = []  # names of what the user had changed and has now for himself
         self._scene = Held(bpy.data.scenes, scene)
         self._slice = -1
@@ -79,7 +80,7 @@ class Owned:
         item = self.known.get(role)
         if item is not None and item.get(NAME) == item.name:
             call(item, name)
-        if item is not None and item.get(GROUP, group) != group:
+        if item is not None and item.get(GROUP, group) != group and item[GROUP] not in self.classes:
             self._rename_group(item[GROUP], group)
         if item is None:
             item = bpy.data.objects.new(name, data)

@@ -22,7 +22,8 @@ MOST_LOSSES = 8  # of workers with one task: then it is the task that ends them
 GRACE = 2.5  # seconds in which tasks may end by themselves after a cancel
 PATIENCE = 600.0  # seconds in which no worker could be used, after which the campaign ends
 RESTED = 20.0  # seconds until a worker that was refused or full is asked again
-USER_FAULTS = ("input", "setting")  # other photos or settings are the user's to give
+# Other photos or settings are the user's to give; what another campaign has taken is not taken back.
+USER_FAULTS = ("input", "setting", "taken")
 
 
 @dataclass

@@ -1,8 +1,10 @@
 """Files between machines without a common folder: any place that fsspec reaches, S3 for instance.
 
-URL/objects/ab/abcd…      the contents of files, named by their SHA-256; never changed, so never half written for a reader
-URL/captures/NAME.json    which files a capture has: {path below the campaign's folder: [SHA-256, bytes, time]}
-URL/captures/NAME.holder  who has the capture: the word of the copy that took it last, which alone changes that list
+    URL/objects/ab/abcd…      the contents of files, named by their SHA-256; never changed, so never half written for a reader
+    URL/captures/NAME.json    which files a capture has: {path below the campaign's folder: [SHA-256, bytes, time]}
+    URL/captures/NAME.holder  who has the capture: the word of the copy that took it last, which alone changes that list
+
+What a machine has of a capture is in working_copy.py.
 """
 
 from __future__ import annotations
@@ -28,6 +30,12 @@ class StorageError(FieldworkError):
     """The storage of a campaign cannot be reached, or lacks a file."""
 
     code = "storage"
+
+
+class TakenError(StorageError):
+    """Somebody else has gone on with a capture."""
+
+    code = "taken"
 
 
 def without_password(text: str) -> str:

@@ -19,7 +19,7 @@ from ..files import STAGED, file_hash, linked, write_json
 from ..project.fingerprints import digest
 from ..project.merged import merged_project
 from ..project.store import LOCK_FILE, PROJECT_FILE, locked
-from .storage import Files, Storage, StorageError
+from .storage import Files, Storage, TakenError
 
 STATE = ".state"  # folder: what was fetched or uploaded last, so that only what changed since is read again
 PLACE = "fieldwork-campaign:"  # stands for the campaign's folder in files that name places
@@ -69,11 +69,11 @@ class Copy:
         self.storage.set_holder(self.capture, self.word)
 
     def _require_taken(self) -> None:
-        """Raise StorageError where somebody else has taken the capture since."""
+        """Raise TakenError where somebody else has taken the capture since."""
         if self.word and self.storage.holder(self.capture) not in (self.word, ""):
-            raise StorageError(
+            raise TakenError(
                 f"Another worker has gone on with {self.capture} meanwhile: what was made here is not uploaded.",
-                "There is nothing to do.",
+                "If another campaign has it, run this one again when that is done.",
             )
 
     def mend(self, objects: set[str]) -> None:

@@ -90,10 +90,11 @@ def _judgement(results: dict[str, Any], evaluation: dict[str, Any]) -> Section:
         return Section(JUDGEMENT, [], [])
     whole = worst(judged)
     level = {"good": "Yes.", "weak": "In part.", "failed": "No."}[whole["level"]]
-    rows = [["in short", level], *(["because", reason] for reason in whole["reasons"])]
+    word = "but" if whole["level"] == "good" else "because"
+    rows = [["in short", level], *([word, reason] for reason in whole["reasons"])]
     told = evaluation.get("advice") or []
     rows += [["next", text] for text in told]
-    if not told and evaluation and whole["level"] == "good":  # else the reasons say what to do
+    if not told and evaluation and not whole["reasons"]:  # else these say what to do
         rows.append(["next", "Nothing: more photos would change little."])
     text = f"By poses, training, {compared(evaluation)} and mesh, as far as these were made."
     return Section(JUDGEMENT, [], rows, text)

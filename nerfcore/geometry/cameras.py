@@ -186,7 +186,7 @@ def widest_angle(distortion: tuple[float, ...]) -> float:
     return float(angle[back[0]]) if len(back) else np.inf
 
 
-@lru_cache(maxsize=256)
+@lru_cache(maxsize=16384)  # of captures whose every photo has a lens of its own, too
 def widest_angles(distortion: tuple[float, ...]) -> np.ndarray | None:
     """The same of a perspective lens in directions (K,) around the axis that are evenly spread from 0 to 2π, both included:
     tangential terms bend the picture back earlier on one side than on the other. None where it nowhere does."""
@@ -225,8 +225,10 @@ def project(camera: Camera, points: np.ndarray) -> np.ndarray:
         if camera.model == "OPENCV" and any(camera.distortion):
             widest = widest_angles(camera.distortion)
             if widest is not None:
-                around = np.arctan2(uv[:, 1], uv[:, 0]) % (2 * np.pi) * (DIRECTIONS / (2 * np.pi))
-                limit = np.tan(np.interp(around, np.arange(DIRECTIONS + 1), widest))
+                limit = np.tan(widest[0])
+                if any(camera.distortion[2:4]):
+                    around = np.arctan2(uv[:, 1], uv[:, 0]) % (2 * np.pi) * (DIRECTIONS / (2 * np.pi))
+                    limit = np.tan(np.interp(around, np.arange(DIRECTIONS + 1), widest))
                 uv = np.where((np.hypot(*uv.T) < limit)[:, None], uv, np.nan)
             uv = _opencv_distort(uv, camera.distortion)[0]
     return uv * [camera.fx, camera.fy] + [camera.cx, camera.cy]

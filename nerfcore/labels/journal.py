@@ -136,9 +136,10 @@ def append_mark(project: Path, values: dict[str, object], below: int | None = No
         marks = read_marks(project)
         sent = next((m for m in reversed(marks) if m.key and m.key == values.get("key")), None)
         if sent is not None:
-            if shown_revision(project, len(marks)) == sent.parent:  # killed between writing and showing it
-                _show(project, sent.revision)
-            return sent
+            top, before = _written_with(marks, sent)
+            if shown_revision(project, len(marks)) == before:  # killed between writing and showing it
+                _show(project, top.revision)
+            return top
         shown = shown_revision(project, len(marks))
         there = marks_at(marks, shown)
         places = [0, *(mark.revision for mark in there)]
@@ -157,6 +158,19 @@ def append_mark(project: Path, values: dict[str, object], below: int | None = No
                 os.truncate(path, end)
                 raise
     return fresh[-1]
+
+
+def _written_with(marks: list[Mark], sent: Mark) -> tuple[Mark, int]:
+    """Of a mark of the journal: itself or the last of those that were put on top of it, and the revision shown before."""
+    place = {"revision", "parent"}
+    earlier = {mark.model_dump_json(exclude=place): mark.revision for mark in marks[: sent.revision - 1]}
+    top, before = sent, sent.parent
+    for mark in marks[sent.revision :]:
+        drawn = earlier.get(mark.model_dump_json(exclude=place))
+        if drawn is None or mark.parent != top.revision:
+            break
+        top, before = mark, drawn
+    return top, before
 
 
 def _append(path: Path, lines: bytes) -> int:

@@ -121,7 +121,9 @@ def flat_views(views: list[View], box_from_world: np.ndarray, longest: int) -> l
 def _faces(camera: Camera, pose: np.ndarray, index: int) -> list[FlatView]:
     """Of the faces of a cube around a wide camera those that show enough of its photo, cut to what they show of it."""
     faces = [_flat(camera, face, pose, turn, index) for face, turn in cube_faces(camera)]
-    return [_cut(face) for face in faces if face.inside.mean() >= SMALLEST_FACE]
+    # A narrow lens fills little even of the only face that shows its photo.
+    least = [min(SMALLEST_FACE * face.inside.size, SMALLEST_FACE * camera.width * camera.height) for face in faces]
+    return [_cut(face) for face, fewest in zip(faces, least) if face.inside.sum() >= fewest]
 
 
 def _cut(view: FlatView) -> FlatView:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import re
 from collections.abc import Collection, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -108,7 +109,7 @@ def with_earlier_numbers(
     face_instance: np.ndarray, instances: list[Instance], earlier: list[Instance]
 ) -> tuple[np.ndarray, list[Instance]]:
     """Instance (F,) of each face and the instances of a mesh that was made again, which have the numbers of the earlier ones of
-    their names: scenes know things by their numbers. Others have numbers that no earlier one had."""
+    their names: scenes know things by their numbers. Others have numbers that none of the last mesh had."""
     known = {old.name: old.id for old in earlier}
     free = itertools.count(1 + max(known.values(), default=0))
     found = [replace(one, id=known.get(one.name) or next(free)) for one in instances]
@@ -123,7 +124,8 @@ def with_class_names(instances: list[Instance], former: Collection[str], names: 
     that is taken."""
     found, taken = [], {one.name for one in instances}
     for one in instances:
-        old = next((name for name in former if one.name.startswith(f"{name}.")), None)
+        numbered = [name for name in former if re.match(rf"{re.escape(name)}\.\d{{3}}(\D|$)", one.name)]
+        old = max(numbered, key=len, default=None)
         if old is not None and one.class_id in names:
             new = names[one.class_id] + one.name[len(old) :]
             one = one if new in taken else replace(one, name=new)

@@ -170,7 +170,7 @@ def judge(
     result |= {"overlap_shown": overlapped, "seen_by_few": round(found.few, 4)}
     guessed = guess_share(built)
     asked = 0.0 if params.watertight else guessed if params.close_gaps else None
-    hit = shown if bounds is None else None
+    hit = shown if bounds is None or solid is None else None  # a region may be little of what photos show
     result["verdict"] = mesh_verdict(
         hit, found.solid, found.holes, largest, found.overlapped, found.few, asked, built.denied
     )

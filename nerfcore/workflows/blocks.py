@@ -182,9 +182,13 @@ def _train(params: p.BlocksParams, plan: Plan, block: BlockPlan, report: Reporte
 
 def _maps(params: p.BlocksParams, plan: Plan, block: BlockPlan, report: Reporter) -> tuple[dict[str, Any], bool]:
     from ..blocks.surface import make_maps
+    from ..mesh.depth_maps import FLAT
 
     folder, own = Path(params.project), block_folder(Path(params.project), block)
+    scene = load_scene(own, params.holdout)
     inputs = {"field": checkpoint_id(own, RUN), "plan": digest(plan.model_dump(mode="json"))}
+    if any(scene.views[i].camera.model not in FLAT for i in scene.train):
+        inputs["pictures"] = "cut"  # earlier versions made others of wide lenses
     run = run_folder(own, RUN)
     make = lambda: {"maps": make_maps(folder, plan, block, report)}  # noqa: E731
     return _kept([run / MAPS, run / SIGHTS], inputs, make)

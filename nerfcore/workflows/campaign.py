@@ -22,6 +22,7 @@ from ..evaluate.report import check_report
 from ..images.suffixes import PHOTO_SUFFIXES
 from ..params import BatchParams, ReconstructParams
 from ..progress import Reporter
+from ..project.store import PROJECT_FILE
 from .captures import Capture
 from .reconstruct import stages_of, summed_up
 from .stage_task import READ, WRITTEN, capture_name, tracked_paths
@@ -172,8 +173,10 @@ def photos_in(photos: Path) -> int:
     """About how many photos there are in a folder and in those in it, as the cameras of a rig have; 150 of a video, or where it
     cannot be read from here."""
     root, count = photos / "images" if (photos / "images").is_dir() else photos, 0
-    for _, folders, files in os.walk(root):
-        folders[:] = [name for name in folders if name not in BESIDE and not name.startswith(".")]
+    for place, folders, files in os.walk(root):
+        beside = BESIDE if Path(place) == photos else ()
+        inside = [name for name in folders if name not in beside and not name.startswith(".")]
+        folders[:] = [name for name in inside if not (Path(place) / name / PROJECT_FILE).is_file()]
         count += sum(Path(name).suffix.lower() in PHOTO_SUFFIXES for name in files)
     return count or 150
 

@@ -208,6 +208,8 @@ with bpy.data.libraries.load(library, link=True) as (_, wanted):
 holder = bpy.data.collections.new("holder")
 bpy.context.scene.collection.children.link(holder)
 if instance:
+    if instance == "beside":
+        bpy.context.scene.collection.children.link(wanted.collections[0])
     empty = bpy.data.objects.new("instance", None)
     empty.instance_type, empty.instance_collection = "COLLECTION", wanted.collections[0]
     holder.objects.link(empty)
@@ -218,14 +220,15 @@ answer(1)
 """
 
 
-@pytest.mark.parametrize("instance", [False, True])
+@pytest.mark.parametrize("instance", ["", "alone", "beside"])
 def test_what_is_linked_from_another_file_has_the_class_of_its_collection(blend, tmp_path, bpy_script, instance):
     bpy_script(LINKED, blend=blend, path=tmp_path / "here.blend", library=tmp_path / "library.blend", instance=instance)
     take(tmp_path / "here.blend", tmp_path / "out", views=1, labels="collection")
     classes = json.loads((tmp_path / "out/classes.json").read_text())["classes"]
     found = {classes[str(number)]: places for number, places in surfaces(tmp_path / "out").items() if number}
-    assert set(found) == {"ground", "holder"}
-    assert found["holder"][:, 2].max() > 0.9, "the cube"
+    own = "things" if instance == "beside" else "holder"  # where it lies itself counts before where it is instanced
+    assert set(found) == {"ground", own}
+    assert found[own][:, 2].max() > 0.9, "the cube"
 
 
 NAMESAKES = """

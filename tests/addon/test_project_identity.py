@@ -434,7 +434,8 @@ def paste(name):
 bpy.ops.wm.save_as_mainfile(filepath=f"{folder}/one/first.blend")
 own = add_field(scene, "//capture").fieldwork
 copy()
-facts = {"saved": paste("two/second.blend"), "unsaved": paste("")}
+bpy.ops.wm.save_as_mainfile(filepath=f"{folder}/one/plain.blend", compress=False, copy=True)
+facts = {"kept": own.folder, "saved": paste("two/second.blend"), "unsaved": paste("")}
 bpy.ops.wm.open_mainfile(filepath=f"{folder}/one/first.blend")
 add_field(bpy.context.scene, "//capture")
 bpy.ops.wm.save_mainfile()
@@ -447,6 +448,8 @@ answer([facts, bpy.app.version >= (4, 3, 0)])
         folder=tmp_path,
     )
     places, told = facts
+    assert places["kept"] == str(project)
+    assert str(project).encode() not in (tmp_path / "one/plain.blend").read_bytes(), "files do not tell where they lay"
     if told:  # Blender 4.2 does not say what was pasted
         assert places["saved"] == [str(project), "//../one/capture"], f"not {other}"
         assert places["unsaved"] == [str(project), str(project)]

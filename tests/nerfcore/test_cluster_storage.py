@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 import pytest
 from fieldwork.nerfcore.cluster import storage as module
-from fieldwork.nerfcore.cluster.storage import Storage, StorageError
+from fieldwork.nerfcore.cluster.run import USER_FAULTS
+from fieldwork.nerfcore.cluster.storage import Storage, StorageError, TakenError
 from fieldwork.nerfcore.cluster.worker import Refusal
 from fieldwork.nerfcore.cluster.working_copy import Copy, Saving, placed
 from fieldwork.nerfcore.errors import FieldworkError, SettingError
@@ -376,8 +377,9 @@ def test_a_worker_that_was_given_up_uploads_nothing_over_the_one_that_went_on(tm
     put(tmp_path / "second", "field.bin", b"whole")
     second.upload()
     put(tmp_path / "first", "field.bin", b"two thirds")
-    with pytest.raises(StorageError, match="Another worker has gone on with vase-1"):
+    with pytest.raises(TakenError, match="Another worker has gone on with vase-1"):
         first.upload()
+    assert TakenError.code in USER_FAULTS, "or it is tried again, and takes it back"
     third = machine(tmp_path / "third", url)
     third.fetch()
     assert (tmp_path / "third/vase/field.bin").read_bytes() == b"whole"

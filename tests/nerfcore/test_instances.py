@@ -65,6 +65,8 @@ def test_new_names_of_classes_do_not_make_two_things_one_name() -> None:
     found = with_class_names(known, {"chair"}, {1: "seat"})
     assert [one.name for one in found] == ["seat.001", "seat.002", "chair.002", "seat.001.2", "chairman", "mine"]
     assert with_class_names(known, (), {1: "seat"}) == known
+    mine = [Instance(1, "chair.left", 2, 1.0, (0, 0, 0))]
+    assert with_class_names(mine, {"chair"}, {1: "seat", 2: "table"}) == mine, "nobody numbered it"
 
 
 def test_nothing_labelled_has_no_instances() -> None:

@@ -190,6 +190,10 @@ def test_marks_drawn_while_something_is_cut_out_stay_on_top_of_it(
     assert [mark.author for mark in at if mark.key == "second"] == (["Ada"] if said else [])
     again = append_mark(project, {**drawn, "points": [(3, 3)], "key": "third"})
     assert again.revision == len(marks), "a mark that is sent again is found where it is now"
+    model = {"photo": "00", "shape": "click", "class_id": 2, "points": [(9, 9)], "key": "model"}
+    assert append_mark(project, model, said).revision == len(marks), "with what was put on top of it"
+    show(project, 2 if said is None else 3)  # as one that was killed before it showed what it had written
+    assert append_mark(project, model, said).revision == len(marks) == shown_revision(project, len(marks))
 
 
 def test_what_is_cut_out_of_undone_marks_goes_on_those_that_are_shown(tmp_path: Path, project: Path) -> None:

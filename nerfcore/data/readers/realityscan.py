@@ -85,10 +85,11 @@ def read(folder: Path) -> Dataset:
 def _of_one_world(files: list[Path]) -> tuple[list[Path], list[Path]]:
     """The files of georeferenced photos, else of the largest component; and the others."""
     texts = [file.read_text(encoding="utf-8", errors="replace") for file in files]
-    worlds = [None if _text(t, "Coordinates") in METRIC else _text(t, "ComponentId") for t in texts]
-    count = Counter(world for world in worlds if world is not None)
-    other = {world for world, _ in count.most_common()[1:]}
-    return [f for f, w in zip(files, worlds) if w not in other], [f for f, w in zip(files, worlds) if w in other]
+    metric = [_text(text, "Coordinates") in METRIC for text in texts]
+    worlds = ["" if own else _text(text, "ComponentId") for own, text in zip(metric, texts)]
+    kept = "" if any(metric) else next((w for w, _ in Counter(filter(None, worlds)).most_common(1)), None)
+    inside = [world in (kept, None) for world in worlds]  # older files name no component
+    return [f for f, one in zip(files, inside) if one], [f for f, one in zip(files, inside) if not one]
 
 
 def _text(text: str, name: str) -> str | None:

@@ -102,7 +102,10 @@ def test_nothing_is_left_to_do_only_where_all_is_good(level: str) -> None:
 
 def test_what_is_said_beside_a_good_verdict_does_not_contradict_it() -> None:
     few = {"verdict": {"level": "good", "reasons": ["Only one photo was compared: hold out more."]}, "advice": []}
-    assert _judgement({}, few).rows == [["in short", "Yes."], ["but", "Only one photo was compared: hold out more."]]
+    assert _judgement({}, few).rows == [
+        ["in short", "Yes."],
+        ["but", "evaluate: Only one photo was compared: hold out more."],
+    ]
 
 
 def test_sizes_of_small_things_keep_their_digits_and_have_units(project: Path) -> None:

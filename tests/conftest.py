@@ -7,6 +7,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
+
+# On a busy machine what takes a millisecond may take a second.
+settings.register_profile("busy", deadline=None)
+settings.load_profile("busy")
 
 # Beside other workers of pytest-xdist a process has its share of the cores. Read when torch is imported.
 if (workers := int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))) > 1:

@@ -213,6 +213,7 @@ class AssistSegmentParams(Params):
     drawn_on: int | None = Field(
         default=None,
         ge=0,
+        le=MANY,
         description="revision of the marks that was shown when it was asked for: marks drawn since stay on top of it",
     )
 

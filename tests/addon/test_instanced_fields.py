@@ -108,6 +108,7 @@ answer(facts)
     assert max(value for values in facts.values() for value in values) < 1e-6
 
 
+@pytest.mark.slow
 def test_an_instance_is_rendered_as_the_field_itself_would_be(bpy_script, ball: Path, tmp_path: Path) -> None:
     facts = bpy_script(
         START

@@ -48,7 +48,7 @@ def blender_projection(settings_, width: int, height: int, points: np.ndarray) -
     return np.stack([width / 2 + x, height / 2 - y / tall], -1)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     width=st.integers(32, 4000),
     height=st.integers(32, 4000),

@@ -70,7 +70,7 @@ def subject_on_floor(seed: int = 0) -> np.ndarray:
 # --- which way is up ------------------------------------------------------------------------------------------------
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(st.integers(0, 10_000), st.floats(0, 4))
 def test_up_of_an_orbit(seed: int, wobble: float) -> None:
     """Any orientation of the frame, cameras held level to a few degrees."""
@@ -129,7 +129,7 @@ def test_up_of_sideways_photos(turn: int) -> None:
     assert 0.4 < confidence <= 0.5
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(st.integers(0, 10_000), st.floats(0.01, 100))
 def test_world_of_unknown_scale(seed: int, scale: float) -> None:
     """Whatever frame SfM chose: z up, cameras three units from the subject, the floor at z = 0."""

@@ -31,27 +31,27 @@ focal = st.floats(150, 900)
 small = st.floats(-0.02, 0.02)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(focal, focal, st.floats(140, 180), st.floats(80, 120))
 def test_pinhole_round_trip(fx: float, fy: float, cx: float, cy: float) -> None:
     assert round_trip(Camera(fx=fx, fy=fy, cx=cx, cy=cy, **sizes)) < 1e-3
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.floats(220, 900), st.floats(-0.12, 0.15), st.floats(-0.02, 0.03), small, small)
 def test_opencv_round_trip(f: float, k1: float, k2: float, p1: float, p2: float) -> None:
     camera = Camera(model="OPENCV", fx=f, fy=f, cx=160, cy=100, distortion=(k1, k2, p1, p2), **sizes)
     assert round_trip(camera) < 1e-3
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(st.floats(250, 900), st.lists(st.floats(-0.03, 0.03), min_size=8, max_size=8), st.sampled_from([5, 8]))
 def test_long_opencv_round_trip(f: float, k: list[float], count: int) -> None:
     camera = Camera(model="OPENCV", fx=f, fy=f, cx=160, cy=100, distortion=tuple(k[:count]), **sizes)
     assert round_trip(camera) < 1e-3
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.floats(120, 400), st.floats(-0.04, 0.06), st.floats(-0.01, 0.01), st.floats(-0.003, 0.003))
 def test_fisheye_round_trip(f: float, k1: float, k2: float, k3: float) -> None:
     camera = Camera(model="OPENCV_FISHEYE", fx=f, fy=f, cx=160, cy=100, distortion=(k1, k2, k3, 0.0), **sizes)
@@ -110,7 +110,7 @@ def seen_again(camera: Camera) -> float:
     return float(np.abs(back - directions[inside])[valid].max())
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.floats(150, 400), st.floats(-0.15, 0.15), st.floats(-0.2, 0.05))
 def test_what_lies_beyond_the_fold_of_a_lens_is_not_in_the_picture(f: float, k1: float, k2: float) -> None:
     lens = {"fx": f, "fy": f, "cx": 160, "cy": 100, **sizes}
@@ -130,7 +130,7 @@ def test_lenses_that_bend_back_on_one_side_show_the_other_whole(p1: float, p2: f
     assert seen_again(camera) < 0.02
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.floats(60, 200), st.floats(-0.05, 0.05), st.floats(-0.02, 0.01), st.floats(-0.001, 0.004))
 def test_what_a_fisheye_does_not_see_is_not_in_the_picture(f: float, k1: float, k2: float, k3: float) -> None:
     lens = {"fx": f, "fy": f, "cx": 160, "cy": 100, **sizes}

@@ -322,7 +322,7 @@ def test_slopes_are_relied_on_where_photos_confirm_or_the_field_is_sharp() -> No
     assert not found[1].any()
 
 
-@pytest.mark.parametrize("focal", [180.0, 260.0, 400.0, 1400.0])  # the last: 26°
+@pytest.mark.parametrize("focal", [180.0, 260.0, 400.0, pytest.param(1400.0, marks=pytest.mark.slow)])  # the last: 26°
 def test_maps_of_wide_lenses_have_as_many_pixels_as_those_of_others(
     focal: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:

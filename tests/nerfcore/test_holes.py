@@ -83,7 +83,7 @@ def test_holes_that_meet_in_a_corner_are_two() -> None:
     assert areas(after, filled).sum() == pytest.approx(1)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.integers(0, 2**32 - 1), st.floats(0.05, 0.5))
 def test_ragged_holes_in_a_plane_are_filled_flat(seed: int, share: float) -> None:
     """Whatever triangles are missing in the middle of a plane: what is filled lies in it, covers nothing twice, and shares edges."""

@@ -91,7 +91,7 @@ def test_weight_gradient_agrees_with_finite_differences(device: torch.device) ->
 
 @pytest.mark.parametrize("kernels", ["warp", "torch"])
 @given(seed=st.integers(0, 10**6))
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 def test_weights_never_exceed_one_and_transmittance_falls(kernels: Kernels, seed: int) -> None:
     generator = torch.Generator().manual_seed(seed)
     packed_info = random_packed_info(20, generator, torch.device("cpu"))
@@ -159,7 +159,7 @@ def test_marching_equals_its_reference(device: torch.device, mode: int, contract
 
 @pytest.mark.parametrize("kernels", ["warp", "torch"])
 @given(seed=st.integers(0, 10**6), mode=st.sampled_from([PDF_DEFAULT, PDF_UNIFORM]), count=st.integers(1, 24))
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 def test_samples_are_sorted_inside_the_open_interval_and_their_lengths_add_up(
     kernels: Kernels, seed: int, mode: int, count: int
 ) -> None:

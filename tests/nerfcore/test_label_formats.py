@@ -348,7 +348,7 @@ def test_photos_with_odd_names_are_found_again(tmp_path: Path, kind: str) -> Non
 
 
 @given(MASKS)
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_run_lengths_come_back(mask: np.ndarray) -> None:
     runs = runs_of(mask)
     assert sum(runs) == mask.size

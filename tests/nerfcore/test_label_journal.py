@@ -45,7 +45,7 @@ LINE = {"photo": "00", "shape": "line", "points": [(1.0, 2.0), (3.0, 4.0)], "wid
 
 
 @given(st.lists(MARKS, min_size=1, max_size=6), st.integers(1, 40))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_marks_are_read_as_they_were_written_and_a_torn_line_is_dropped(
     tmp_path_factory: pytest.TempPathFactory, values: list[dict], cut: int
 ) -> None:

@@ -49,7 +49,7 @@ def dense(edges, prior, strength, sink, seeds, values) -> np.ndarray:
 
 
 @given(st.integers(0, 10_000), st.integers(20, 80), st.integers(1, 4))
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 def test_it_solves_what_a_dense_solver_solves(seed: int, count: int, classes: int) -> None:
     problem = some_graph(seed, count, classes)
     found = random_walk(*problem, tolerance=1e-6)
@@ -140,7 +140,7 @@ def test_a_short_mark_counts_as_much_as_a_long_one_of_its_class() -> None:
 
 
 @given(st.integers(0, 1000))
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 def test_calibration_keeps_the_winner_and_can_be_taken_back(seed: int) -> None:
     p = np.random.default_rng(seed).dirichlet(np.ones(4), 50)[:, :3].astype(np.float32)
     sharp = calibrated(p, CERTAINTY)
@@ -178,7 +178,7 @@ def test_outlines_and_clicks() -> None:
 
 
 @given(st.integers(1, 500), st.integers(0, 1000))
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 def test_cells_are_no_more_than_wanted_and_hold_what_is_near(wanted: int, seed: int) -> None:
     points = np.random.default_rng(seed).random((1000, 3))
     number, count = cell_of(points, wanted)

@@ -37,7 +37,7 @@ def needed(photos: list[Photo]) -> float:
     return texels_needed(*WALL, photos, Reporter())
 
 
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 @given(pixels=st.floats(100, 5000), away=st.floats(1.5, 20))
 def test_there_are_so_many_texels_a_pixel(pixels: float, away: float) -> None:
     # The photo is taken from nearly the front.

@@ -50,9 +50,8 @@ def make_levels(surface: Surface, texture: Texture | None, count: int, report: R
     samples, _ = sample_surface(surface.vertices.astype(np.float64), surface.faces, SAMPLES)
     labels = np.stack([surface.face_class, _instances(surface)], 1)
     rows, patch = np.unique(labels, axis=0, return_inverse=True)
-    middle = (
-        surface.vertices.min(0).astype(np.float64) + surface.vertices.max(0)
-    ) / 2  # the world's origin may be far off
+    # The world's origin may be far off.
+    middle = (surface.vertices.min(0).astype(np.float64) + surface.vertices.max(0)) / 2
     vertices, faces, patch = surface.vertices - middle, surface.faces.astype(np.int64), patch.reshape(-1)
     levels = []
     for number in range(1, count + 1):

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable, Mapping
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+from ..capture.find import list_photos
 from ..cluster import status as st
 from ..cluster.estimate import Durations
 from ..cluster.link import Link
@@ -17,12 +17,10 @@ from ..cluster.storage import Storage
 from ..cluster.tasks import Need, Task
 from ..cluster.working_copy import Copy
 from ..config import make_config
-from ..errors import Cancelled, SettingError, explained
+from ..errors import Cancelled, FieldworkError, SettingError, explained
 from ..evaluate.report import check_report
-from ..images.suffixes import PHOTO_SUFFIXES
 from ..params import BatchParams, ReconstructParams
 from ..progress import Reporter
-from ..project.store import PROJECT_FILE
 from .captures import Capture
 from .reconstruct import stages_of, summed_up
 from .stage_task import READ, WRITTEN, capture_name, tracked_paths
@@ -37,7 +35,6 @@ BYTES_A_PIXEL = 5  # colour, alpha and label
 FIELD_FLOATS = 4  # value, gradient, two moments
 SMALLEST_GPU_GB = 8.0  # shares of a GPU are for one of this size
 MANY_PHOTOS, MOST_SHARES = 200, 16  # from so many on pairs are matched in parts, at most so many
-BESIDE = ("labels", "masks", "depth")  # folders among photos that hold none
 PART = 32  # frames of a render that one worker makes
 SHOWN = (("failed", 8), ("running", 20), ("waiting", 4))  # captures in the terminal's table
 WRITE_EVERY, PAGE_EVERY = 2.0, 10.0  # seconds
@@ -170,15 +167,11 @@ def _sizes(preset: str, settings: tuple[tuple[str, str], ...]) -> tuple[float, i
 
 
 def photos_in(photos: Path) -> int:
-    """About how many photos there are in a folder and in those in it, as the cameras of a rig have; 150 of a video, or where it
-    cannot be read from here."""
-    root, count = photos / "images" if (photos / "images").is_dir() else photos, 0
-    for place, folders, files in os.walk(root):
-        beside = BESIDE if Path(place) == photos else ()
-        inside = [name for name in folders if name not in beside and not name.startswith(".")]
-        folders[:] = [name for name in inside if not (Path(place) / name / PROJECT_FILE).is_file()]
-        count += sum(Path(name).suffix.lower() in PHOTO_SUFFIXES for name in files)
-    return count or 150
+    """How many photos there are in a folder; 150 of a video, or where it cannot be read from here."""
+    try:
+        return len(list_photos(photos)[0])
+    except (FieldworkError, OSError):
+        return 150
 
 
 def need_of(stage: str, memory: dict[str, float]) -> Need:

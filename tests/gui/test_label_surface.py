@@ -11,7 +11,7 @@ from fieldwork.nerfcore.params import LabelPrepareParams, MeshParams, TrainParam
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.project.store import edit_project
 from fieldwork.nerfcore.verbs import run_verb
-from fieldwork.tests.gui.test_live import REASON, colour, played, window
+from fieldwork.tests.gui.test_live import REASON, nearest, played, window
 from fieldwork.tests.nerfcore.support.ball import RADIUS, SMALL, ball_project
 
 pytestmark = [
@@ -54,6 +54,6 @@ def test_strokes_on_the_surface_become_marks(ball: Path, suite: str) -> None:
         assert len(places) > 5
         np.testing.assert_allclose(np.linalg.norm(places, axis=1), RADIUS, atol=0.05)
         np.testing.assert_allclose(places[:, 2], height * RADIUS, atol=0.05)
-        # The stroke is drawn in the color of its class.
-        seen = colour(folder, "surface", facts["seen"][str(height)])
-        np.testing.assert_allclose(seen, facts["colors"][str(mark["class_id"])], atol=0.15)
+        # The stroke is drawn in the color of its class, where the bumps of the mesh do not hide it.
+        wanted = facts["colors"][str(mark["class_id"])]
+        np.testing.assert_allclose(nearest(folder, "surface", facts["seen"][str(height)], wanted), wanted, atol=0.05)

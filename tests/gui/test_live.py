@@ -61,11 +61,22 @@ def played(
     return facts, session.folder
 
 
-def colour(folder: Path, shot: str, place: list[int]) -> np.ndarray:
-    """Mean colour of some pixels of a screenshot, in [0, 1]."""
+def around(folder: Path, shot: str, place: list[int]) -> np.ndarray:
+    """Colours (25, 3) in [0, 1] of the pixels around a place in a screenshot."""
     pixels = np.asarray(Image.open(folder / f"{shot}.png").convert("RGB"), np.float64) / 255
     x, y = place
-    return pixels[y - 2 : y + 3, x - 2 : x + 3].mean((0, 1))
+    return pixels[y - 2 : y + 3, x - 2 : x + 3].reshape(-1, 3)
+
+
+def colour(folder: Path, shot: str, place: list[int]) -> np.ndarray:
+    """Their mean colour (3,)."""
+    return around(folder, shot, place).mean(0)
+
+
+def nearest(folder: Path, shot: str, place: list[int], wanted: list[float]) -> np.ndarray:
+    """Their colour (3,) that is nearest to the one wanted."""
+    pixels = around(folder, shot, place)
+    return pixels[np.abs(pixels - wanted).max(1).argmin()]
 
 
 @pytest.mark.parametrize("suite", ["sid", "sid-vulkan", "trixie"])

@@ -70,6 +70,13 @@ def _disk_error(error: Exception) -> OSError:
     return OSError(int(found[1]) if found else errno.EIO, str(error))
 
 
+def is_finite(trainer: Trainer) -> bool:
+    """Whether all that was learned is a number. What is not stays so, as steps without finite gradients are left out."""
+    grid = trainer.model.field.grid
+    learned = [*trainer.model.parameters(), *([] if grid is None else [grid.table])]
+    return all(bool(torch.isfinite(values).all()) for values in learned)
+
+
 def restore(trainer: Trainer, tensors: dict[str, torch.Tensor], state: dict[str, Any]) -> None:
     """Put a checkpoint back into a trainer of the same configuration."""
     model = {name.removeprefix("model."): value for name, value in tensors.items() if name.startswith("model.")}

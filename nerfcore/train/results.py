@@ -29,8 +29,8 @@ class ShardResult:
 
 @dataclass(frozen=True)
 class Learned:
-    """What a step learned from a batch: its shards; gradients of the model's parameters, in their order, and whether all
-    are finite (); its loss and squared error (). The grid's gradients are in the grid."""
+    """What a step learned from a batch: its shards; gradients of the model's parameters, in their order, and whether they
+    and the loss are finite (); its loss and squared error (). The grid's gradients are in the grid."""
 
     batch: Batch
     shards: list[ShardResult]
@@ -47,7 +47,8 @@ class Learned:
 
 @dataclass
 class Measured:
-    """Sums over the steps since the last reading; `loss` and `mse` stay on the device until they are read.
+    """Sums over the steps since the last reading; `loss` and `mse`, of the steps that were finite, and how many those were
+    stay on the device until they are read.
 
     With a fixed capacity, `dropped`: rays that were left out for want of it, as far as the device was asked; `skipped`:
     steps without finite gradients, and `lost_rows`: rows of the grid that were left out for the same reason.
@@ -55,6 +56,7 @@ class Measured:
 
     loss: float | torch.Tensor = 0.0
     mse: float | torch.Tensor = 0.0
+    finite: int | torch.Tensor = 0
     steps: int = 0
     rays: int = 0
     samples: int = 0
@@ -63,5 +65,9 @@ class Measured:
     lost_rows: int = 0
 
     @property
+    def mean_loss(self) -> float:
+        return float(self.loss) / max(int(self.finite), 1)
+
+    @property
     def psnr(self) -> float:
-        return psnr(float(self.mse) / max(self.steps, 1))
+        return psnr(float(self.mse) / max(int(self.finite), 1))

@@ -50,7 +50,8 @@ class SkyStage:
         if self.needed is None:
             near = ~self.masks.at(batch.image, batch.pixel)
             share = (weight * near).sum() / near.sum().clamp(min=1)
-            self.share += torch.where(near.any(), RATE * (share - self.share), 0.0)
+            counts = near.any() & torch.isfinite(share)
+            self.share += torch.where(counts, RATE * (share - self.share), 0.0)
 
     def decide(self, steps: int, progress: float) -> bool:
         """Decide, where `steps` of training or `progress` are enough for it; reads from the device once.

@@ -211,12 +211,12 @@ class Trainer:
         for parts in zip(*(part.gradients for part in shards)):
             present = [g for g in parts if g is not None]
             gradients.append(self.guard.unscaled(torch.stack(present).sum(0)) if present else None)
-        finite = self.guard.inspected([g for g in gradients if g is not None])
         grid = self.model.field.grid
         if grid is not None:
             encoded = [(points, self.guard.unscaled(g)) for part in shards for points, g in part.encoded]
             grid.scatter(encoded, self.model.field.gains)
         loss, error = (torch.stack(list(values)).sum() for values in zip(*((p.loss, p.squared_error) for p in shards)))
+        finite = self.guard.inspected([g for g in gradients if g is not None]) & torch.isfinite(loss)
         return Learned(batch, shards, gradients, finite, loss, error)
 
     def _take(self, learned: Learned) -> None:
@@ -224,8 +224,9 @@ class Trainer:
         for parameter, gradient in zip(self.model.parameters(), learned.gradients):
             parameter.grad = gradient
         self.guard.finite = learned.finite
-        self.measured.loss += learned.loss
-        self.measured.mse += learned.squared_error
+        self.measured.loss += torch.where(learned.finite, learned.loss, 0.0)
+        self.measured.mse += torch.where(learned.finite, learned.squared_error, 0.0)
+        self.measured.finite += learned.finite.int()
 
     def _shard_tasks(self, batch: Batch, progress: float) -> list[Callable[[], ShardResult]]:
         """Tasks that learn from the rays of a batch.

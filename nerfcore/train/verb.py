@@ -50,7 +50,7 @@ from ..render.run import (
 )
 from ..render.unfinished import Unfinished
 from ..verdict import train_verdict
-from .checkpoint import restore, save_checkpoint
+from .checkpoint import is_finite, restore, save_checkpoint
 from .closed_picture import closed_picture, picture_closed
 from .initial_state import InitialState
 from .inputs import as_noted, data_inputs, settings_kept, training_inputs, training_length
@@ -265,6 +265,8 @@ class _Loop:
                 self.report.check()
             self.state["progress"] = 1.0
             self._write_event(1.0, max(time.perf_counter() - last_event, 1e-3))
+            if self.state["psnr"] is None:
+                raise _diverged()
 
     def _start_over_if_needed(self, progress: float) -> None:
         """Start over, with masks of the sky, where these have turned out to be needed."""
@@ -308,24 +310,19 @@ class _Loop:
 
     def _write_event(self, progress: float, elapsed: float) -> None:
         measured = self.trainer.take_measured()
-        loss = float(measured.loss)
-        if measured.steps == 0:
+        self._warn(measured)
+        if int(measured.finite) == 0:  # the trainer says when that goes on for too long
             return
-        if not loss < float("inf"):
-            raise TrainingError(
-                "Training diverged: the loss is no longer a number.", "Lower train.network_rate and train.grid_rate."
-            )
         self.state["psnr"] = round(measured.psnr, 3)
         values = {
             "step": self.trainer.steps,
             "seconds": round(self.clock.seconds(), 2),
-            "loss": round(loss / measured.steps, 6),
+            "loss": round(measured.mean_loss, 6),
             "psnr": self.state["psnr"],
             "rays_per_second": round(measured.rays / elapsed),
         }
         counts = {"dropped": measured.dropped, "skipped": measured.skipped, "lost_rows": measured.lost_rows}
         values |= {name: count for name, count in counts.items() if count > 0}
-        self._warn(measured)
         with open(self.place.folder / EVENTS, "a", encoding="utf-8") as events:
             events.write(json.dumps(values) + "\n")
         self.report.event("train", **values)
@@ -333,6 +330,8 @@ class _Loop:
 
     def checkpoint(self) -> None:
         trainer, info = self.trainer, self.info
+        if not is_finite(trainer):  # what was saved before is worth more
+            raise _diverged()
         save_checkpoint(self.place.folder / CHECKPOINT, trainer, {**self.state, "training": info.origin.training})
         if trainer.poses is not None:
             path = self.place.folder / REFINED_POSES
@@ -370,6 +369,12 @@ class _Loop:
             self.report.warn(str(error))
             return False
         return True
+
+
+def _diverged() -> TrainingError:
+    return TrainingError(
+        "Training diverged: what it learns is no longer a number.", "Lower train.network_rate and train.grid_rate."
+    )
 
 
 def _preview(

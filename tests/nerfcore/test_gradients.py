@@ -3,16 +3,23 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 from fieldwork.nerfcore.errors import TrainingError
 from fieldwork.nerfcore.kernels.device import Kernels, using_kernels
+from fieldwork.nerfcore.params import TrainParams
+from fieldwork.nerfcore.progress import Reporter
+from fieldwork.nerfcore.project.runs import read_events
 from fieldwork.nerfcore.train.checkpoint import restore, trainer_tensors
+from fieldwork.nerfcore.train.composite_loss import composite_loss
 from fieldwork.nerfcore.train.gradients import FIRST_SCALE, GROWTH_STEPS, GradientGuard
 from fieldwork.nerfcore.train.trainer import Trainer
-from fieldwork.tests.nerfcore.support.ball import ball_project
+from fieldwork.nerfcore.verbs import run_verb
+from fieldwork.tests.nerfcore.support.ball import SMALL, ball_project
 from fieldwork.tests.nerfcore.support.settings import trainer_of
 
 CPU = torch.device("cpu")
@@ -149,3 +156,65 @@ def test_training_survives_a_gradient_that_is_not_finite_and_gives_up_when_they_
     trainer._take = broken
     with pytest.raises(TrainingError, match="not been finite"):
         many_steps(trainer)
+
+
+def loses_numbers(monkeypatch: pytest.MonkeyPatch, lost: Callable[[int], bool]) -> None:
+    """The losses of the steps for which `lost` says so are not numbers."""
+    real, steps = Trainer.step, []
+
+    def step(trainer: Trainer, progress: float) -> None:
+        steps.append(progress)
+        real(trainer, progress)
+
+    def loss(*args: Any, **named: Any) -> tuple[torch.Tensor, torch.Tensor]:
+        total, error = composite_loss(*args, **named)
+        return (total * math.nan, error * math.nan) if lost(len(steps)) else (total, error)
+
+    monkeypatch.setattr(Trainer, "step", step)
+    monkeypatch.setattr("fieldwork.nerfcore.train.trainer.composite_loss", loss)
+
+
+def train(project: Path, run: str, steps: int) -> dict[str, Any]:
+    return run_verb("train", TrainParams(project=project, preset="draft", run=run, steps=steps, set=SMALL), Reporter())
+
+
+def test_a_loss_that_is_not_a_number_costs_a_step_and_not_the_training(
+    ball: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    loses_numbers(monkeypatch, lambda step: step == 12)
+    result = train(ball, "once", 60)
+    assert result["steps"] == 60
+    assert math.isfinite(result["psnr_train"])
+    events = read_events(ball / "runs" / "once")
+    assert sum(event.get("skipped", 0) for event in events) == 1
+    assert all(math.isfinite(event["loss"]) for event in events)
+
+
+def test_training_whose_losses_stay_no_numbers_ends_with_a_sentence(
+    ball: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    loses_numbers(monkeypatch, lambda step: step > 5)
+    with pytest.raises(TrainingError, match="not been finite"):
+        train(ball, "ever", 2000)
+    monkeypatch.undo()
+    loses_numbers(monkeypatch, lambda step: True)
+    with pytest.raises(TrainingError, match="no longer a number"):
+        train(ball, "never", 5)
+
+
+def test_a_field_that_is_no_longer_a_number_does_not_replace_what_was_saved(
+    ball: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    train(ball, "kept", 5)
+    path = ball / "runs" / "kept" / "field.safetensors"
+    before, real = path.read_bytes(), Trainer.step
+
+    def step(trainer: Trainer, progress: float) -> None:
+        real(trainer, progress)
+        with torch.no_grad():
+            next(trainer.model.parameters()).fill_(math.inf)
+
+    monkeypatch.setattr(Trainer, "step", step)
+    with pytest.raises(TrainingError, match="no longer a number"):
+        train(ball, "kept", 5)
+    assert path.read_bytes() == before

@@ -90,6 +90,12 @@ def test_rays_of_nothing_near_tell_nothing(stage: tuple[SkyStage, Batch, torch.T
     assert float(watched.share) == 1.0
 
 
+def test_a_step_whose_weights_are_not_numbers_tells_nothing(stage: tuple[SkyStage, Batch, torch.Tensor]) -> None:
+    watched, batch, _ = stage
+    watched.observe(batch, torch.full((len(batch.rgb),), torch.nan))
+    assert float(watched.share) == 1.0
+
+
 @pytest.mark.setting("train.environment_start")
 def test_training_is_masked_until_the_stage_ends(court: Path) -> None:
     trainer = environment_trainer(court, train__environment_start="0.5")

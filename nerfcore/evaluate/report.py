@@ -7,14 +7,14 @@ import io
 from pathlib import Path
 from typing import Any
 
-from ..errors import ProjectError, SettingError
+from ..errors import SettingError
 from ..files import write_text
 from ..measure.lettering import warn_of_missing
 from ..measure.stored import read_measures
 from ..measure.wording import significant
 from ..params import ReportParams
 from ..progress import Reporter
-from ..project.runs import known_runs, read_events, read_metrics, run_folder
+from ..project.runs import known_runs, no_such_run, read_events, read_metrics, run_folder
 from ..project.store import load_project
 from ..render.pictures import ENDINGS
 from .documentation import JUDGEMENT, Section, compared, results_of, sections, titled
@@ -68,7 +68,7 @@ def report(params: ReportParams, reporter: Reporter) -> dict[str, Any]:
     folder = Path(params.project)
     project, known = load_project(folder), known_runs(folder)
     if params.run not in (*known, ReportParams.model_fields["run"].default):  # without any, the photos are reported
-        raise ProjectError(f"{folder} has no run “{params.run}”.", f"Its runs: {', '.join(known) or 'none'}.")
+        raise no_such_run(folder, params.run)
     out = params.out or folder / "exports" / params.run / "report.html"
     check_report(out)
     results = results_of(project, params.run)

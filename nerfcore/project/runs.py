@@ -13,6 +13,7 @@ import shutil
 from pathlib import Path
 from typing import Any
 
+from ..errors import ProjectError
 from ..files import disk_errors, json_lines
 from .fingerprints import digest
 
@@ -50,6 +51,18 @@ def known_runs(project: Path) -> list[str]:
     trained = (path.name for path in run_folder(project, "").glob("[!.]*") if path.is_dir())
     meshed = (path.parent.name for path in (Path(project) / "exports").glob(f"*/{MESH_RECORD}"))
     return sorted({*trained, *meshed})
+
+
+def no_such_run(project: Path, run: str) -> ProjectError:
+    """The error that a project has no run of this name, and which ones it has."""
+    known = known_runs(project)
+    hint = f"Its runs: {', '.join(known)}." if known else "Run `fieldwork train` first."
+    return ProjectError(f"{project} has no run “{run}”.", hint)
+
+
+def is_begun(project: Path, run: str) -> bool:
+    """Whether a run was trained, or has begun to be, with or without a checkpoint."""
+    return any(folder.is_dir() for folder in (fresh_folder(project, run), run_folder(project, run)))
 
 
 def has_checkpoint(folder: Path) -> bool:

@@ -22,7 +22,7 @@ from ..files import write_json
 from ..geometry.similarity import transform_pose
 from ..kernels.device import use_device
 from ..progress import Reporter, shortened
-from ..project.runs import CHECKPOINT, HOLDOUT, INFO, run_folder, settle, state_id
+from ..project.runs import CHECKPOINT, HOLDOUT, INFO, no_such_run, run_folder, settle, state_id
 from ..project.schema import Poses, Project
 from ..project.store import load_project, world_from_sfm
 from .kept_grid import KeptGrid, read_tensor
@@ -118,7 +118,7 @@ def load_info(project: Path, run: str) -> RunInfo:
     """Raises ProjectError when there is no such run or its config.json is damaged."""
     settle(project, run)
     if not (run_folder(project, run) / INFO).is_file():
-        raise ProjectError(f"{project} has no run “{run}”.", "Run `fieldwork train` first.")
+        raise no_such_run(project, run)
     return read_info(run_folder(project, run))
 
 

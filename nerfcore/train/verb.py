@@ -33,6 +33,9 @@ from ..project.runs import (
     METRICS,
     TrainingFolder,
     cut_events,
+    is_begun,
+    known_runs,
+    no_such_run,
     read_events,
 )
 from ..project.store import load_project, record_step
@@ -89,7 +92,7 @@ def train(params: TrainParams, report: Reporter) -> dict[str, Any]:
     """
     project_folder = Path(params.project)
     device = use_device()
-    place = TrainingFolder.to_resume(project_folder, params.run) if params.resume else None
+    place = _place_to_resume(project_folder, params.run, report) if params.resume else None
     saved = None
     if place is not None:
         info, scene = _resumable(place, params, report)
@@ -144,6 +147,20 @@ def train(params: TrainParams, report: Reporter) -> dict[str, Any]:
     done = {"preset": info.preset, "holdout": info.holdout, "config": info.config.model_dump(mode="json")}
     record_step(project_folder, "train", params.model_dump(mode="json") | done, result, info.origin.inputs)
     return result
+
+
+def _place_to_resume(project: Path, run: str, report: Reporter) -> TrainingFolder | None:
+    """Where the training of a run goes on; None where it was stopped before its first checkpoint, or is the project's first.
+
+    Raises:
+        ProjectError: there is no such run, but there are others.
+    """
+    place = TrainingFolder.to_resume(project, run)
+    if place is None:
+        if not is_begun(project, run) and known_runs(project):
+            raise no_such_run(project, run)
+        report.note(f"The run “{run}” has no checkpoint to go on from: training begins.")
+    return place
 
 
 def _planned(params: TrainParams, device: torch.device) -> tuple[RunInfo, Scene]:
@@ -239,7 +256,7 @@ class _Loop:
         train = self.info.config.train
         last_event = last_checkpoint = last_preview = time.perf_counter()
         cost = 0.0  # seconds of the last preview
-        seen = False
+        seen, began = False, self.trainer.steps
         with disk_errors(self.place.folder):
             while (progress := self.progress()) < 1:
                 if self.trainer.steps in MEASURED_STEPS and self.state["largest_batch"] is None:
@@ -265,7 +282,7 @@ class _Loop:
                 self.report.check()
             self.state["progress"] = 1.0
             self._write_event(1.0, max(time.perf_counter() - last_event, 1e-3))
-            if self.state["psnr"] is None:
+            if self.state["psnr"] is None and self.trainer.steps > began:
                 raise _diverged()
 
     def _start_over_if_needed(self, progress: float) -> None:

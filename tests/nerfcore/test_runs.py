@@ -126,6 +126,17 @@ def test_names_of_runs(name: str, tmp_path: Path) -> None:
         TrainParams(project=tmp_path, run=name)
 
 
+class Noting(Reporter):
+    """Keeps the notes."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.notes: list[str] = []
+
+    def note(self, message: str) -> None:
+        self.notes.append(message)
+
+
 class Stopping(Reporter):
     """Cancels once training has done a step, or only watches."""
 
@@ -222,6 +233,19 @@ def test_an_evaluation_is_of_the_field_that_was_measured(project: Path) -> None:
     assert evaluated(asked).result is not None
     train(params(project, steps=14, resume=True), Reporter())
     assert evaluated(asked).reason == "changed: trained field"
+
+
+def test_a_run_that_is_not_there_does_not_go_on(project: Path, tmp_path: Path) -> None:
+    with pytest.raises(ProjectError, match=r"has no run “mian”\. Its runs: main\."):
+        train(params(project, run="mian", resume=True), Reporter())
+    assert not run_folder(project, "mian").exists()
+    # One that was stopped before its first checkpoint has nothing to go on from, and the first of a project neither.
+    run_folder(project, "begun").mkdir()
+    report = Noting()
+    assert train(params(project, run="begun", steps=2, resume=True), report)["steps"] == 2
+    assert any("“begun” has no checkpoint to go on from" in note for note in report.notes)
+    first = ball_project(tmp_path / "first", views=3, side=16)
+    assert train(params(first, steps=2, resume=True), Reporter())["steps"] == 2
 
 
 def test_a_run_of_another_project_does_not_go_on(project: Path, tmp_path: Path) -> None:

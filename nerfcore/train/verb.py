@@ -12,9 +12,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from ..config import make_config, with_rendering_of
+from ..config import make_config
 from ..data.box import box_poses
-from ..data.load import load_scene
 from ..data.pixels import training_size
 from ..data.scene import Scene
 from ..errors import Cancelled, DiskError, ProjectError, TrainingError
@@ -25,7 +24,6 @@ from ..kernels.device import use_device
 from ..kernels.runtime import compile_seconds
 from ..params import TrainParams
 from ..progress import Reporter
-from ..project.fingerprints import difference, digest
 from ..project.runs import (
     CHECKPOINT,
     EVENTS,
@@ -33,9 +31,6 @@ from ..project.runs import (
     METRICS,
     TrainingFolder,
     cut_events,
-    is_begun,
-    known_runs,
-    no_such_run,
     read_events,
 )
 from ..project.store import load_project, record_step
@@ -46,20 +41,18 @@ from ..render.run import (
     REFINED_POSES,
     Origin,
     RunInfo,
-    read_checkpoint,
-    read_info,
     save_info,
-    settled_as,
 )
 from ..render.unfinished import Unfinished
 from ..verdict import train_verdict
 from .checkpoint import is_finite, restore, save_checkpoint
 from .closed_picture import closed_picture, picture_closed
 from .initial_state import InitialState
-from .inputs import as_noted, data_inputs, settings_kept, training_inputs, training_length
+from .inputs import training_inputs, training_length
 from .pose_refinement import write_poses
 from .prepare import make_trainer, plan_run
 from .results import Measured
+from .resume import place_to_resume, resumable, saved_state
 from .schedule import largest_batch
 from .trainer import Trainer
 from .voxel_init import save_features, why_without_effect
@@ -92,11 +85,11 @@ def train(params: TrainParams, report: Reporter) -> dict[str, Any]:
     """
     project_folder = Path(params.project)
     device = use_device()
-    place = _place_to_resume(project_folder, params.run, report) if params.resume else None
+    place = place_to_resume(project_folder, params.run, report) if params.resume else None
     saved = None
     if place is not None:
-        info, scene = _resumable(place, params, report)
-        saved = _saved(place, info, device)
+        info, scene = resumable(place, params, report)
+        saved = saved_state(place, info, device)
         cut_events(place.folder)
     else:
         info, scene = _planned(params, device)
@@ -127,10 +120,11 @@ def train(params: TrainParams, report: Reporter) -> dict[str, Any]:
     report.stage("Training")
     loop = _Loop(trainer, initial, info, place, state, limit, params.time_limit, report)
     del initial
-    shown = Unfinished(project_folder, params.run, info, scene, trainer.model)
+    model = trainer.model
+    del trainer  # another one takes its place where training starts over
     try:
-        with report.watching(shown) as show:
-            loop.run(_preview(project_folder, place, info, scene, trainer.model), show)
+        with report.watching(Unfinished(project_folder, params.run, info, scene, model)) as show:
+            loop.run(_preview(project_folder, place, info, scene, model), show)
     except Cancelled:
         loop.checkpoint()
         raise
@@ -149,20 +143,6 @@ def train(params: TrainParams, report: Reporter) -> dict[str, Any]:
     return result
 
 
-def _place_to_resume(project: Path, run: str, report: Reporter) -> TrainingFolder | None:
-    """Where the training of a run goes on; None where it was stopped before its first checkpoint, or is the project's first.
-
-    Raises:
-        ProjectError: there is no such run, but there are others.
-    """
-    place = TrainingFolder.to_resume(project, run)
-    if place is None:
-        if not is_begun(project, run) and known_runs(project):
-            raise no_such_run(project, run)
-        report.note(f"The run “{run}” has no checkpoint to go on from: training begins.")
-    return place
-
-
 def _planned(params: TrainParams, device: torch.device) -> tuple[RunInfo, Scene]:
     """A new run with the fingerprint of its inputs, and its scene. Raises ProjectError, SettingError, TrainingError."""
     project, config = Path(params.project), make_config(params.preset, params.set)
@@ -173,54 +153,6 @@ def _planned(params: TrainParams, device: torch.device) -> tuple[RunInfo, Scene]
         inputs=training_inputs(project, params, config),
     )
     return info, scene
-
-
-def _saved(
-    place: TrainingFolder, info: RunInfo, device: torch.device
-) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
-    """Tensors and state of the checkpoint to go on from.
-
-    Raises:
-        ProjectError: it is damaged, or of another training than config.json beside it.
-    """
-    saved = read_checkpoint(place.folder / CHECKPOINT, device)
-    if saved[1].get("training", "") != info.origin.training:
-        raise ProjectError(
-            f"{place.folder / CHECKPOINT} is not of the training that {INFO} beside it describes.",
-            "Train the run anew, without --resume.",
-        )
-    return saved
-
-
-def _resumable(place: TrainingFolder, params: TrainParams, report: Reporter) -> tuple[RunInfo, Scene]:
-    """The run to go on with, and its scene.
-
-    Raises:
-        ProjectError: it is of another project, or what it was trained on is no longer the same.
-    """
-    info = read_info(place.folder)
-    if info.origin.project and info.origin.project != load_project(place.project).uuid:
-        raise ProjectError(
-            f"The run “{place.run}” in {place.folder} was trained in another project.",
-            "Train it anew, without --resume.",
-        )
-    if info.origin.inputs:
-        now = as_noted(data_inputs(place.project, info.holdout, info.config), info)
-        changed = difference({name: info.origin.inputs.get(name, "") for name in now}, now)
-        if changed:
-            raise ProjectError(
-                f"The run “{place.run}” cannot go on: since it began, these have {changed}.",
-                "Train it anew, without --resume.",
-            )
-        length = training_length(params.steps, params.time_limit, info.config)
-        info.origin.inputs["length of training"] = digest(length)
-    asked = make_config(info.preset, params.set) if params.set else info.config
-    info.config = with_rendering_of(info.config, asked, params.set)
-    kept = settings_kept(info, params, settled_as(asked, info.config))
-    if kept:
-        what = ", ".join(kept)
-        report.warn(f"The run “{place.run}” goes on with the settings it began with, not with those given now: {what}.")
-    return info, load_scene(place.project, info.holdout)
 
 
 class _Loop:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import weakref
 from pathlib import Path
 from typing import Any
 
@@ -168,6 +169,22 @@ def test_train_begins_anew_where_masks_are_needed(court: Path, taken: float, mon
     def told(sky: SkyStage, batch: Batch, weight: torch.Tensor) -> None:
         sky.share.fill_(taken)
 
+    trainers: list[weakref.ref[Trainer]] = []
+    begin = Trainer.__init__
+
+    def begun(trainer: Trainer, *arguments: Any) -> None:
+        begin(trainer, *arguments)
+        trainers.append(weakref.ref(trainer))
+
+    alive: list[int] = []
+
+    def counted(trainer: Trainer, progress: float) -> None:
+        step(trainer, progress)
+        alive.append(sum(each() is not None for each in trainers))
+
+    step = Trainer.step
+    monkeypatch.setattr(Trainer, "__init__", begun)
+    monkeypatch.setattr(Trainer, "step", counted)
     monkeypatch.setattr(Trainer, "_learn", watched)
     monkeypatch.setattr(SkyStage, "observe", told)
     settings = {**SMALL, "scene.background": "environment"}
@@ -181,6 +198,8 @@ def test_train_begins_anew_where_masks_are_needed(court: Path, taken: float, mon
     first = 4  # steps until a third of the first 0.3
     assert masked == [False] * first + [True] * 9 + [False] * 21 if taken else [False] * 30
     assert len(report.notes) == (1 if taken else 0)
+    assert len(trainers) == (2 if taken else 1)
+    assert set(alive) == {1}, "the trainer that began first is let go of"
 
 
 @pytest.mark.slow

@@ -28,11 +28,23 @@ def trainer_tensors(trainer: Trainer) -> dict[str, torch.Tensor]:
     tensors["generator"] = trainer.generator.get_state()
     if trainer.guard.scaling:
         tensors["loss_scale"], tensors["loss_scale_steps"] = trainer.guard.scale, trainer.guard.good_steps
+    if trainer.model.has_fixed_capacity():
+        tensors["counted"] = trainer.counted
     if trainer.cache.hit is not None:
         tensors["cache.hit"] = trainer.cache.hit
     if trainer.poses is not None:
         tensors.update({f"poses.{name}": value for name, value in trainer.poses.tensors().items()})
     return tensors
+
+
+def trainer_numbers(trainer: Trainer) -> dict[str, Any]:
+    """Every number of the host that training depends on."""
+    numbers: dict[str, Any] = {"steps": trainer.steps, "rays": trainer.rays}
+    if trainer.sky is not None:
+        numbers["sky_masks"] = trainer.sky.needed
+    if trainer.model.has_fixed_capacity():
+        numbers["visible_share"], numbers["drawn"] = trainer.model.host_visible_share, trainer.drawn
+    return numbers
 
 
 def save_checkpoint(path: Path, trainer: Trainer, state: dict[str, Any]) -> None:
@@ -42,10 +54,7 @@ def save_checkpoint(path: Path, trainer: Trainer, state: dict[str, Any]) -> None
         DiskError: the disk is full or the folder is not writable; an older checkpoint stays as it was.
     """
     tensors = {name: value.detach().cpu().contiguous() for name, value in trainer_tensors(trainer).items()}
-    numbers: dict[str, Any] = {"steps": trainer.steps, "rays": trainer.rays}
-    if trainer.sky is not None:
-        numbers["sky_masks"] = trainer.sky.needed
-    write_checkpoint(path, tensors, {**state, **numbers})
+    write_checkpoint(path, tensors, {**state, **trainer_numbers(trainer)})
 
 
 def write_checkpoint(path: Path, tensors: dict[str, torch.Tensor], state: dict[str, Any]) -> None:
@@ -97,6 +106,11 @@ def restore(trainer: Trainer, tensors: dict[str, torch.Tensor], state: dict[str,
     trainer.guard.good_steps = tensors.get("loss_scale_steps", trainer.guard.good_steps)
     trainer.cache.hit = tensors.get("cache.hit")
     trainer.steps, trainer.rays = state["steps"], state["rays"]
+    # What the host last read of the device, and what it will read next.
+    trainer.model.host_visible_share = state.get("visible_share", float(trainer.model.visible_share))
+    if "counted" in tensors:
+        trainer.counted.copy_(tensors["counted"])
+        trainer.drawn = state["drawn"]
 
 
 def _restore_generator(trainer: Trainer, saved: torch.Tensor, steps: int) -> None:

@@ -79,8 +79,8 @@ class Trainer:
         self.pixel_features: PixelFeatures | None = None
         self.measured = Measured()
         # Of the steps since the host last asked the device: samples evaluated and rays dropped (2,), and rays drawn.
-        self._counted = torch.zeros(2, device=self.device)
-        self._drawn = 0
+        self.counted = torch.zeros(2, device=self.device)
+        self.drawn = 0
         self._not_finite = 0  # readings in a row that told of gradients that are not finite
         recorded = self.backend.name == "warp-cuda"
         recorder = partial(CudaRecording, device=self.device, generator=self.generator) if recorded else None
@@ -191,8 +191,8 @@ class Trainer:
         if self.model.has_fixed_capacity():
             # How many entries were used only the device knows; `_ask_device` reads it.
             dropped = [r.samples.packed_info.dropped for r in learned.rendered]
-            self._counted[0] += sum((r.evaluated_density >= 0).sum() for r in learned.rendered)
-            self._counted[1] += sum(d for d in dropped if d is not None)
+            self.counted[0] += sum((r.evaluated_density >= 0).sum() for r in learned.rendered)
+            self.counted[1] += sum(d for d in dropped if d is not None)
         return learned
 
     def _learn(self, progress: float, moving: PoseRefinement | None = None) -> Learned:
@@ -343,7 +343,7 @@ class Trainer:
         m.steps += 1
         m.rays += rays
         if self.model.has_fixed_capacity():
-            self._drawn += rays
+            self.drawn += rays
             return
         evaluated = sum(r.evaluated for r in rendered)
         m.samples += evaluated
@@ -363,8 +363,8 @@ class Trainer:
             TrainingError: gradients have not been finite for long.
         """
         grid, m = self.model.field.grid, self.measured
-        lost = self._counted.new_zeros(1) if grid is None else grid.lost.float()
-        numbers = [self._counted, self.guard.skipped.view(1), lost, self.model.visible_share.view(1)]
+        lost = self.counted.new_zeros(1) if grid is None else grid.lost.float()
+        numbers = [self.counted, self.guard.skipped.view(1), lost, self.model.visible_share.view(1)]
         evaluated, dropped, skipped, lost_rows, visible_share = torch.cat(numbers).tolist()
         self.model.host_visible_share = visible_share
         m.samples += int(evaluated)
@@ -372,14 +372,14 @@ class Trainer:
         if not self.guard.scaling:  # there some steps tell that the scale is too large
             m.skipped += int(skipped)
             m.lost_rows += int(lost_rows)
-        if self._drawn > 0:
+        if self.drawn > 0:
             before = self.rays
-            self._set_rays(before, evaluated / self._drawn, progress)
+            self._set_rays(before, evaluated / self.drawn, progress)
             if self.replay.active and abs(self.rays - before) < STEADY * before:
                 self.rays = before
-        self._counted.zero_()
+        self.counted.zero_()
         self.guard.skipped.zero_()
-        self._drawn = 0
+        self.drawn = 0
         if grid is not None:
             grid.lost.zero_()
         self._not_finite = self._not_finite + 1 if skipped + lost_rows > 0 else 0

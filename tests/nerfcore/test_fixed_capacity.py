@@ -13,6 +13,7 @@ from fieldwork.nerfcore.kernels.packed_info import PackedInfo
 from fieldwork.nerfcore.params import TrainParams
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.render.model import Model, Rendered
+from fieldwork.nerfcore.train.checkpoint import restore, trainer_numbers, trainer_tensors
 from fieldwork.nerfcore.train.composite_loss import composite_loss
 from fieldwork.nerfcore.train.losses import distortion_loss
 from fieldwork.nerfcore.train.prepare import make_trainer, plan_run
@@ -279,6 +280,28 @@ def test_the_number_of_rays_follows_the_samples_that_are_used(ball: Path) -> Non
     assert trainer.rays > 1.2 * budget / trainer.config.sampling.samples
     assert measured.samples / measured.steps == pytest.approx(budget, rel=0.2)
     assert measured.dropped < 0.02 * measured.rays
+
+
+def test_a_resumed_training_has_the_capacity_and_rays_it_would_have_had(ball: Path) -> None:
+    whole, parts = (trainer_of(ball) for _ in range(2))
+    for trainer in (whole, parts):
+        trainer.model.fixed_capacity = True
+        for step in range(52):
+            if step == 40:
+                trainer.model.visible_share.fill_(0.3)
+            trainer.step(step / 100)
+    kept = {name: value.clone() for name, value in trainer_tensors(parts).items()}
+    resumed = trainer_of(ball)
+    resumed.model.fixed_capacity = True
+    restore(resumed, kept, trainer_numbers(parts))
+    assert resumed.model.fixed_shares() == whole.model.fixed_shares()
+    assert whole.model.fixed_shares()[0], "two passes"
+    for step in range(52, 70):  # beyond the next reading of what the device counted
+        for trainer in (whole, resumed):
+            trainer.step(step / 100)
+    assert resumed.rays == whole.rays
+    expected, found = trainer_tensors(whole), trainer_tensors(resumed)
+    assert [name for name in expected if not torch.equal(expected[name], found[name])] == []
 
 
 def test_rays_are_shuffled_where_some_may_be_dropped(ball: Path) -> None:

@@ -71,6 +71,7 @@ class Runner:
         self.cut_short: dict[str, float] = {}  # silent tasks that were given up, and when
         self.starved = 0.0  # since when no node may be used
         self.watched = 0.0
+        self.attempts = 0  # that were handed out
 
     def run(self) -> None:
         """Work until every task has ended.
@@ -119,9 +120,10 @@ class Runner:
             self.cut_short.pop(task.id, None)  # that was another attempt
             need = limited(task.need, allowed)
             cores, memory, gpus = cores - need.cores, memory - need.memory_gb, gpus - need.gpu
+            self.attempts += 1
             job = {
                 "function": task.function,
-                "values": task.values,
+                "values": {**task.values, "attempt": self.attempts},
                 "version": __version__,
                 "folder": str(self.options.folder),
                 "storage": self.options.storage,

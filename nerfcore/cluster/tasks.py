@@ -27,7 +27,7 @@ class Task:
     """One piece of work for a worker.
 
     `function` is "module:name" below this package's parent, called as function(values, report) → JSON-ready dict;
-    `values` is all it is told, JSON-ready. `group` is the capture it belongs to, `stage` what is done of it. Tasks with
+    `values` is all it is told, JSON-ready, beside the number of the “attempt”. `group` is the capture it belongs to, `stage` what is done of it. Tasks with
     a higher `priority` come first, then those of captures begun earlier. `needs` are tasks that must be done before.
     """
 

@@ -62,19 +62,33 @@ class Copy:
                     found[path.relative_to(self.folder).as_posix()] = path
         return found
 
-    def take(self) -> None:
+    def take(self, campaign: str = "", attempt: int = 0) -> None:
         """Have the capture from now on: whoever had it before uploads nothing of it any more. A worker that was given up for
-        being silent may live, and be heard again when another has long gone on with its work."""
-        self.word = uuid.uuid4().hex
+        being silent may live, and be heard again when another has long gone on with its work.
+
+        Args:
+            campaign, attempt: a campaign counts its attempts, from 1 on. One of them takes a capture from earlier attempts of its
+                own campaign alone: one that was given up before it had begun may begin later. 0: from whoever has it.
+        Raises:
+            TakenError: a later attempt or another campaign has it.
+        """
+        holder = self.storage.holder(self.capture)
+        having, _, number = holder.rpartition(":")
+        if attempt and holder and (having != campaign or int(number) > attempt):
+            raise self._taken()
+        self.word = f"{campaign or uuid.uuid4().hex}:{attempt}"
         self.storage.set_holder(self.capture, self.word)
 
     def _require_taken(self) -> None:
         """Raise TakenError where somebody else has taken the capture since."""
         if self.word and self.storage.holder(self.capture) not in (self.word, ""):
-            raise TakenError(
-                f"Another worker has gone on with {self.capture} meanwhile: what was made here is not uploaded.",
-                "If another campaign has it, run this one again when that is done.",
-            )
+            raise self._taken()
+
+    def _taken(self) -> TakenError:
+        return TakenError(
+            f"Another worker has gone on with {self.capture} meanwhile: what was made here is not uploaded.",
+            "If another campaign has it, run this one again when that is done.",
+        )
 
     def mend(self, objects: set[str]) -> None:
         """Forget what the storage has lost, so that what there is of it here is uploaded again.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+import uuid
 from collections.abc import Callable, Mapping
 from functools import lru_cache
 from pathlib import Path
@@ -65,7 +66,7 @@ def run(
     link = Link(params.cluster or "auto", params.wheel)
     folder = params.list.absolute().parent
     campaign = Campaign(params, captures, entries, note, report)
-    tasks = plan(todo, folder, params.storage)
+    tasks = plan(todo, folder, params.storage, campaign.name)
     for task in tasks:
         campaign.stages.setdefault(task.group, []).append(task)
     if params.storage:
@@ -81,7 +82,7 @@ def run(
         raise
 
 
-def plan(captures: list[Capture], folder: Path, storage: str | None = None) -> list[Task]:
+def plan(captures: list[Capture], folder: Path, storage: str | None = None, campaign: str = "") -> list[Task]:
     """The tasks of captures, in the order in which they are begun: a capture that was begun is brought to its end first.
 
     Raises:
@@ -103,7 +104,8 @@ def plan(captures: list[Capture], folder: Path, storage: str | None = None) -> l
         whole = storage or params.time_limit is not None
         parts = [] if whole else frame_ranges(params.render_count)
         shares = 0 if storage else matching_shares(photos_in(params.photos))
-        tasks += capture_tasks(params, priority, parts, {"folder": str(folder), "storage": storage}, shares)
+        shared = {"folder": str(folder), "storage": storage, "campaign": campaign}
+        tasks += capture_tasks(params, priority, parts, shared, shares)
     return tasks
 
 
@@ -208,6 +210,7 @@ class Campaign:
         self.captures = {str(capture.params.out): capture.params for capture in captures}
         self.numbers = {key: number for number, key in enumerate(self.captures)}
         self.folder, self.started = folder_of(params.list), time.time()
+        self.name = uuid.uuid4().hex  # another one each time that it runs
         self.stages: dict[str, list[Task]] = {}
         self.pictures: dict[str, str] = {}
         self.copies: dict[str, Copy] = {}
@@ -228,7 +231,7 @@ class Campaign:
             self.report.progress(number / len(todo), params.out.name)
             copy = Copy(storage, folder, capture_name(params, folder), tracked_paths(params))
             self.copies[str(params.out)] = copy
-            copy.take()
+            copy.take(self.name)
             copy.mend(objects)
             if copy.changed():
                 copy.upload()

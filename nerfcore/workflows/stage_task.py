@@ -32,7 +32,8 @@ def run_stage(values: dict[str, Any], report: Reporter) -> dict[str, Any]:
     Args:
         values: "capture": settings of reconstruct; "stage"; "frame_range": of a part of the stage render; "matching": of poses only “features”,
             or one of so many parts of the pairs, as [number, parts]; "folder": of the campaign, the only one that is written in;
-            "storage": None, or the URL from which files are fetched into a folder of this machine, and left.
+            "storage": None, or the URL from which files are fetched into a folder of this machine, and left; then "campaign" and
+            "attempt", see `Copy.take`.
     Returns:
         {"result": what the verb returned, None where it had nothing to do, "seconds", "reused", "redone": why or None}
     Raises:
@@ -51,7 +52,7 @@ def run_stage(values: dict[str, Any], report: Reporter) -> dict[str, Any]:
     def reads(name: str) -> bool:
         return needed(name, values["stage"], params, here)
 
-    copy.take()
+    copy.take(values.get("campaign", ""), values.get("attempt", 0))
     copy.fetch(reads, report.check)
     copy.begin(reads)
     with Saving(copy, SAVE_EVERY):

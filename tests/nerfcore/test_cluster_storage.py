@@ -385,6 +385,25 @@ def test_a_worker_that_was_given_up_uploads_nothing_over_the_one_that_went_on(tm
     assert (tmp_path / "third/vase/field.bin").read_bytes() == b"whole"
 
 
+def test_an_attempt_that_was_given_up_before_it_had_begun_does_not_take_its_capture_back(
+    tmp_path: Path, url: str
+) -> None:
+    machine(tmp_path / "head", url).take("first")
+    late, second, other = (machine(tmp_path / name, url) for name in ("late", "second", "other"))
+    second.take("first", attempt=2)
+    put(tmp_path / "second", "field.bin", b"whole")
+    with pytest.raises(TakenError, match="Another worker has gone on with vase-1"):
+        late.take("first", attempt=1)
+    assert second.upload() == 1
+    second.take("first", attempt=3)  # of the next stage
+    machine(tmp_path / "head", url).take("second")  # another campaign
+    with pytest.raises(TakenError):
+        late.take("first", attempt=4)
+    with pytest.raises(TakenError):
+        second.upload()
+    other.take("second", attempt=1)
+
+
 def test_a_stage_whose_capture_another_worker_took_ends_without_its_files(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -140,8 +140,10 @@ def _device() -> _Device:
     except (ImportError, OSError):
         return found
     from ..kernels.device import backend_of, choose_device, free_memory, native_half
+    from ..kernels.host import default_threads
 
     try:
+        default_threads()
         device = choose_device()
         backend = backend_of(device)
     except SettingError as error:

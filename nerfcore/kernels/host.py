@@ -10,6 +10,8 @@ from functools import cache
 
 import psutil
 
+from ..errors import SettingError
+
 log = logging.getLogger("fieldwork")
 
 # Of glibc's mallopt, see malloc.h.
@@ -23,12 +25,17 @@ def default_threads() -> int:
     """Threads to compute with: one for each core that this process may use.
 
     FIELDWORK_THREADS overrides it, and so does OMP_NUM_THREADS.
+
+    Raises:
+        SettingError: FIELDWORK_THREADS is no number above 0.
     """
     available = len(os.sched_getaffinity(0)) if sys.platform == "linux" else (os.cpu_count() or 1)
     for name in ("FIELDWORK_THREADS", "OMP_NUM_THREADS"):
         text = os.environ.get(name, "")
         if text.isdecimal() and int(text) > 0:
             return int(text)
+        if text and name == "FIELDWORK_THREADS":
+            raise SettingError(f"{name} is “{text}”.", "Set it to a number above 0, or leave it out.")
     return available
 
 

@@ -7,7 +7,11 @@ import subprocess
 import sys
 
 import pytest
+from fieldwork.nerfcore.engine.doctor import doctor
+from fieldwork.nerfcore.errors import SettingError
 from fieldwork.nerfcore.kernels.host import NICE, default_threads
+from fieldwork.nerfcore.params import DoctorParams
+from fieldwork.nerfcore.progress import Reporter
 
 FAULTS = """
 import resource, sys
@@ -50,9 +54,16 @@ def test_every_core_computes_unless_told_otherwise(monkeypatch: pytest.MonkeyPat
     assert default_threads() == 3
     monkeypatch.setenv("FIELDWORK_THREADS", "5")
     assert default_threads() == 5
-    for nonsense in ("0", "-2", "many", ""):
-        monkeypatch.setenv("FIELDWORK_THREADS", nonsense)
-        assert default_threads() == 3
+    monkeypatch.setenv("FIELDWORK_THREADS", "")
+    assert default_threads() == 3
+
+
+@pytest.mark.parametrize("nonsense", ["0", "-2", "many", "2.5"])
+def test_a_number_of_threads_that_is_none_is_told(nonsense: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("FIELDWORK_THREADS", nonsense)
+    with pytest.raises(SettingError, match=f"FIELDWORK_THREADS is “{nonsense}”. Set it to a number above 0"):
+        default_threads()
+    assert any("FIELDWORK_THREADS" in problem for problem in doctor(DoctorParams(), Reporter())["problems"])
 
 
 @pytest.mark.skipif(sys.platform != "linux" or os.confstr("CS_GNU_LIBC_VERSION") is None, reason="not glibc")

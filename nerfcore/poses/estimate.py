@@ -17,13 +17,14 @@ from ..geometry.frames import upright
 from ..geometry.points import Points
 from ..params import PosesParams
 from ..progress import Reporter, shortened
+from ..project.fingerprints import Fingerprint
 from ..project.kept import earlier_cut_outs, earlier_poses, keep_world
 from ..project.schema import Frame, ImageRecord, PosedImage, Poses, Project
 from ..project.store import FRAMES_FILE, FRAMES_FOLDER, POSES_FILE, edit_project, load_poses, load_project, save_poses
 from ..verdict import poses_verdict
 from .align import gps_frame
 from .exposure import exposure_gains
-from .inputs import STATE_FILE, WORK_FOLDER, changed, photo_state, photos_found, posing_inputs, usable
+from .inputs import STATE_FILE, WORK_FOLDER, changed, photo_state, photos_found, posing_inputs, recorded, usable
 from .process import run_worker
 from .zoom import lens_groups
 
@@ -60,6 +61,7 @@ def estimate_poses(params: PosesParams, report: Reporter) -> dict[str, Any]:
             "Add photos with `fieldwork new --add`; twenty to a hundred around the subject work well.",
         )
     inputs, before = posing_inputs(folder, project, params), earlier_poses(folder)
+    _require_group(project, params, inputs)
     job = pose_job(folder, project, params, report)
     result = run_worker(job, folder / WORK_FOLDER, report)
     # Classes and region may have been edited meanwhile.
@@ -108,6 +110,25 @@ def estimate_poses(params: PosesParams, report: Reporter) -> dict[str, Any]:
         where = f"{len(missing)} of {answer['total']} photos have no pose"
         report.warn(f"{shortened(where, missing)} {folder / REPORT_FILE} says why.")
     return answer
+
+
+def _require_group(project: Project, params: PosesParams, inputs: Fingerprint) -> None:
+    """Raise PosesError where it is known beforehand that there is no such group of photos."""
+    count, made = len(usable(project)), recorded(project)
+    if MIN_PHOTOS * (params.group + 1) > count:
+        raise PosesError(
+            f"--group {params.group}: {count} photos do not fall into {params.group + 1} groups.",
+            "Choose a smaller --group.",
+        )
+    if made is None or params.restart or params.preset != made.settings.get("preset"):
+        return
+    found = made.result.get("groups", [])
+    same = all(made.inputs.get(name) == value for name, value in inputs.items() if name != "settings")
+    if same and found and params.group >= len(found):
+        raise PosesError(
+            f"--group {params.group}: the photos fall into {len(found)} group{'s' * (len(found) != 1)}.",
+            "Choose a smaller --group, or look for groups anew with --restart.",
+        )
 
 
 def with_gains(

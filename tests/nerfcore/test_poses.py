@@ -302,7 +302,7 @@ def test_two_unrelated_scenes(shared_data: Data, tmp_path: Path) -> None:
     assert {i["name"] for i in other["images"] if i["status"] == "ok"} == {
         i["name"] for i in other["images"] if i["name"].startswith("fox")
     }
-    with pytest.raises(PosesError, match="do not fall into 8 groups"):
+    with pytest.raises(PosesError, match="18 photos do not fall into 8 groups"):
         poses(project, group=7)
 
 
@@ -468,6 +468,19 @@ def test_the_verb_says_groups_and_judges(tmp_path: Path, monkeypatch: pytest.Mon
     assert f"3 of 10 pairs of photos match but contradict their poses, most often those of {first}, {second}" in alike
     assert "2 groups of 5 and 3" in report.warnings[0]
     assert "--group 1" in report.warnings[0]
+    # What is known beforehand is told at once.
+    monkeypatch.setattr(estimate, "run_worker", lambda *_: pytest.fail("the photos were matched"))
+    for group, reason in ((1, "the photos were matched"), (2, "8 photos do not fall into 3 groups")):
+        with pytest.raises((PosesError, pytest.fail.Exception), match=reason):
+            estimate.estimate_poses(PosesParams(project=project, group=group), Reporter())
+    monkeypatch.setattr(estimate, "MIN_PHOTOS", 2)
+    for values, reason in (
+        ({}, "fall into 2 groups. Choose a smaller --group, or look"),
+        ({"restart": True}, "the photos were matched"),
+        ({"preset": "robust"}, "the photos were matched"),
+    ):
+        with pytest.raises((PosesError, pytest.fail.Exception), match=reason):
+            estimate.estimate_poses(PosesParams(project=project, group=2, **values), Reporter())
 
 
 def test_files_that_could_not_be_read_are_the_reason(monkeypatch: pytest.MonkeyPatch) -> None:

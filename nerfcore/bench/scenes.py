@@ -29,6 +29,27 @@ def available(scene: str, data: Path | None) -> bool:
     return scene in SCENES or is_project(Path(scene)) or (data is not None and (data / scene).is_dir())
 
 
+def require_scenes(scenes: list[str], data: Path | None, out: Path) -> None:
+    """Look at all scenes that were named, before the first is made.
+
+    Raises:
+        InputError: there is no such scene, or two have the same name.
+    """
+    names = [scene_name(scene) for scene in scenes]
+    for scene, name in zip(scenes, names):
+        if not available(scene, data) and not is_project(out / "projects" / name):
+            raise _no_scene(scene, data)
+        if names.count(name) > 1:
+            raise InputError(f"Two scenes are called “{name}”.", "Rename one of the folders, or name it once.")
+
+
+def _no_scene(scene: str, data: Path | None) -> InputError:
+    return InputError(
+        f"There is no scene “{scene}” in {data or 'a data folder'}.",
+        f"Name a data set there, {', '.join(SCENES)} or a project.",
+    )
+
+
 def scene_name(scene: str) -> str:
     return Path(scene).name
 
@@ -64,10 +85,7 @@ def prepare(scene: str, data: Path | None, out: Path, report: Reporter) -> Path:
         simulate(SimulateParams(out=capture, scene=scene), report)
         import_dataset(ImportParams(dataset=capture / "ground_truth", project=half_made), report)
     else:
-        raise InputError(
-            f"There is no scene “{scene}” in {data or 'a data folder'}.",
-            f"Name a data set there, {', '.join(SCENES)} or a project.",
-        )
+        raise _no_scene(scene, data)
     half_made.rename(project)
     return project
 

@@ -68,6 +68,15 @@ def variants(suite: str) -> dict[str, dict[str, str]]:
     return {"standard": {}}
 
 
+def chosen_variants(params: BenchParams) -> list[str]:
+    """The variants of the suite that are asked for. Raises SettingError where it does not have one."""
+    found = variants(params.suite)
+    for name in params.variants or []:
+        if name not in found:
+            raise SettingError(f"The suite {params.suite} has no variant “{name}”.", f"It has: {', '.join(found)}.")
+    return params.variants or list(found)
+
+
 def limits(params: BenchParams, steps: int) -> dict[str, float | int | None]:
     """Where a training ends: after the seconds or steps that were asked for, else after `steps`, the suite's own."""
     own = params.seconds is None and params.steps is None
@@ -83,11 +92,7 @@ def plan(params: BenchParams, scenes: list[str]) -> list[Job]:
     Raises:
         SettingError: a variant the suite does not have.
     """
-    suite, found = params.suite, variants(params.suite)
-    wanted = params.variants or list(found)
-    unknown = [name for name in wanted if name not in found]
-    if unknown:
-        raise SettingError(f"The suite {suite} has no variant “{unknown[0]}”.", f"It has: {', '.join(found)}.")
+    suite, found, wanted = params.suite, variants(params.suite), chosen_variants(params)
     own = params.seconds is None and params.steps is None
     seconds = SECONDS.get(suite) if own else params.seconds
     steps = STEPS.get(suite) if own else params.steps

@@ -23,8 +23,8 @@ from . import machine, tables
 from .jobs import Measure, run_all, unknown_origin
 from .page import check_page, figures_folder, write_page
 from .results import Asked, ResultSet, Row, grouped, write_set
-from .scenes import available, data_folder, is_labelled, prepare, scene_name
-from .suites import PUBLISHED_DROPS, SCENES, SECONDS, plan
+from .scenes import available, data_folder, is_labelled, prepare, require_scenes, scene_name
+from .suites import PUBLISHED_DROPS, SCENES, SECONDS, chosen_variants, plan
 
 
 def bench(params: BenchParams, report: Reporter) -> dict[str, Any]:
@@ -49,6 +49,7 @@ def bench(params: BenchParams, report: Reporter) -> dict[str, Any]:
         from .measures import measures_suite
 
         return measures_suite(params, out, command_of(params), report)
+    chosen_variants(params)
     data = data_folder(params.data)
     projects, notes = _scenes(params, data, root, report)
     if params.suite == "labels":
@@ -108,6 +109,7 @@ def _measure_of(suite: str, root: Path) -> Measure | None:
 def _scenes(params: BenchParams, data: Path | None, root: Path, report: Reporter) -> tuple[dict[str, Path], list[str]]:
     """Projects of the suite's scenes, and a note for each that is left out. Scenes named by the user must be there."""
     notes, projects = [], {}
+    require_scenes(params.scenes or [], data, root)
     for scene in params.scenes or SCENES[params.suite]:
         if not params.scenes and not available(scene, data):
             notes.append(f"{scene} is left out: there is no such data set in {data or '../shared/data'}.")
@@ -120,8 +122,6 @@ def _scenes(params: BenchParams, data: Path | None, root: Path, report: Reporter
         if not params.scenes and params.suite in ("ablation", "robustness", "labels") and not is_labelled(project):
             notes.append(f"{scene} is left out: it has no labels.")
             continue
-        if scene_name(scene) in projects:
-            raise InputError(f"Two scenes are called “{scene_name(scene)}”.", "Rename one of the folders.")
         projects[scene_name(scene)] = project
     if not projects:
         raise InputError("None of the suite's scenes is there.", "Give a folder of data sets with --data.")

@@ -4,11 +4,15 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
 from fieldwork.nerfcore.bench import tables
 from fieldwork.nerfcore.bench.scenes import available
 from fieldwork.nerfcore.bench.suites import ABLATION, ROBUSTNESS, TIMED, plan
+from fieldwork.nerfcore.bench.verb import bench
 from fieldwork.nerfcore.config import make_config
+from fieldwork.nerfcore.errors import InputError, SettingError
 from fieldwork.nerfcore.params import BenchParams
+from fieldwork.nerfcore.progress import Reporter
 
 
 def test_a_variant_is_what_its_name_says() -> None:
@@ -28,6 +32,17 @@ def test_simulated_scenes_need_no_data(tmp_path: Path) -> None:
     assert available("facade", tmp_path)
     assert not available("replica_room", None)
     assert not available("replica_room", tmp_path)
+
+
+def test_wrong_names_are_told_before_anything_is_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("fieldwork.nerfcore.bench.verb.prepare", lambda *_: pytest.fail("a scene was made"))
+    for values, error in (
+        ({"scenes": ["museum", "musuem"]}, "There is no scene “musuem”"),
+        ({"scenes": ["museum", "museum"]}, "Two scenes are called “museum”"),
+        ({"variants": ["hybrid", "explict"]}, "has no variant “explict”"),
+    ):
+        with pytest.raises((InputError, SettingError), match=error):
+            bench(BenchParams.model_validate({"suite": "ablation", "out": tmp_path, **values}), Reporter())
 
 
 def test_the_plan_has_equal_steps_and_equal_time() -> None:

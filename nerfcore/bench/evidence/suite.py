@@ -15,7 +15,7 @@ from ...kernels.device import use_device
 from ...params import BenchParams
 from ...progress import Reporter
 from ..machine import describe
-from ..scenes import available, data_folder, is_labelled, prepare, scene_name
+from ..scenes import available, data_folder, is_labelled, prepare, require_scenes, scene_name
 from .page import add_results, check_page, folder_of, read_records, write_page
 from .perceptual import Perceptual
 from .protocol import Trial, expected_seconds, planned, protocol, trials_of
@@ -123,6 +123,7 @@ def _kept(
 def _projects(params: BenchParams, root: Path, names: list[str], report: Reporter) -> tuple[dict[str, Path], list[str]]:
     """Projects of the scenes that are there, and a note for each that is not."""
     data, notes, projects = data_folder(params.data), [], {}
+    require_scenes(params.scenes or [], data, root)
     given = {scene_name(scene): scene for scene in params.scenes or []}
     for name in names:
         scene = given.get(name, name)

@@ -107,7 +107,7 @@ class FIELDWORK_OT_render(ProjectOperator):
     needs = (need_run,)
 
     out: StringProperty(
-        name="Output", description="Folder for the images; empty: exports/renders of the project", subtype="DIR_PATH",
+        name="Output", description="Folder for the images; empty: renders of the run, in exports of the project", subtype="DIR_PATH",
         options={"SKIP_SAVE"},
     )  # fmt: skip
     camera: StringProperty(
@@ -140,7 +140,7 @@ class FIELDWORK_OT_render(ProjectOperator):
     def parameters(self, context: Context) -> dict[str, Any]:
         project, run = self.project_path(context), self.value(context, "run")
         source, size = self.value(context, "source"), tuple(self.value(context, "size"))
-        folder = paths.absolute(self.out) if self.out else Path(project) / "exports" / "renders" / source
+        folder = paths.absolute(self.out) if self.out else Path(project) / "exports" / run / "renders" / source
         passes = self.value(context, "passes")
         if not passes:
             raise ValueError(t("Choose at least one pass."))

@@ -61,7 +61,7 @@ def blend_inputs(params: BlendParams) -> Fingerprint:
     folder = params.project.absolute()
     scene = load_scene(folder, holdout_of(folder, params.run))
     exports = folder / "exports" / params.run
-    renders = photo_renders(folder, params.renders)
+    renders = photo_renders(folder, params.run, params.renders)
     pictures = sorted(renders.glob("*.png")) if renders.is_dir() else []
     return {
         "mesh": files_digest((name, exports / name) for name in ("mesh.npz", "texture.png", INSTANCES, MEASURES)),

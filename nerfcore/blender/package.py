@@ -81,7 +81,7 @@ def write_package(
     with disk_errors(folder):
         (folder / "images").mkdir(parents=True, exist_ok=True)
     report.stage("Undistorting the photos")
-    cameras = _write_pictures(scene, folder, photo_renders(project, renders), report)
+    cameras = _write_pictures(scene, folder, photo_renders(project, run, renders), report)
     _remove_others(folder, cameras)
     points = scene.points
     with atomic_path(folder / "points.npz") as temporary, open(temporary, "wb") as out:
@@ -115,9 +115,11 @@ def write_package(
     return folder
 
 
-def photo_renders(project: Path, renders: Path | None) -> Path:
-    """The folder of renders from the photos' cameras: the one given, else where Blender's panel puts them."""
-    return renders or project / "exports" / "renders" / "photos"
+def photo_renders(project: Path, run: str, renders: Path | None) -> Path:
+    """The folder of renders from the photos' cameras: the one given, else where Blender's panel puts those of a run; earlier
+    versions put those of all runs into one."""
+    own, common = (project / "exports" / place / "photos" for place in (f"{run}/renders", "renders"))
+    return renders or (common if common.is_dir() and not own.is_dir() else own)
 
 
 def stale(project: Path, run: str, renders: Path | None = None, pictures: bool = True) -> list[str]:
@@ -135,7 +137,7 @@ def stale(project: Path, run: str, renders: Path | None = None, pictures: bool =
             )
         elif trained:
             notes.append(f"The mesh is from an earlier training of the run “{run}”. Run `fieldwork mesh` again.")
-    shown = read_made(photo_renders(project, renders) / RENDER_RECORD) if pictures else None
+    shown = read_made(photo_renders(project, run, renders) / RENDER_RECORD) if pictures else None
     if shown is not None and shown.settings.get("run") != run:
         notes.append(f"The renders of the photos are of the run “{shown.settings.get('run')}”, not of “{run}”.")
     elif shown is not None and state is not None and shown.checkpoint != state_id(state):

@@ -47,5 +47,5 @@ class PackageParams(Params):
     project: Path
     run: RunName = "main"
     renders: Path | None = Field(
-        default=None, description="folder of rendered photos; default: exports/renders/photos of the project"
+        default=None, description="folder of rendered photos; default: exports/RUN/renders/photos of the project"
     )

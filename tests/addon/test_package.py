@@ -149,7 +149,7 @@ def test_textures_of_earlier_meshes_stay_in_the_package_for_a_while(tmp_path):
 
 
 def test_renders_of_the_photos_that_are_of_another_run_are_told(tmp_path):
-    made = photo_renders(tmp_path, None) / RENDER_RECORD
+    made = tmp_path / "exports/renders/photos" / RENDER_RECORD  # where earlier versions put those of all runs
     made.parent.mkdir(parents=True)
     write_made(made, step("render", {"run": "second"}, {}))
     assert stale(tmp_path, "second") == []
@@ -270,6 +270,17 @@ answer([slot.image.filepath for slot in imported.cameras[0].data.background_imag
     (renders / "a.png").unlink()
     write_package(tmp_path, "main", taken, "p", Reporter())
     assert not list((folder / "renders").iterdir()), "what is gone from the project is gone from the package"
+
+
+def test_renders_of_photos_are_those_of_the_run(tmp_path: Path) -> None:
+    common = tmp_path / "exports/renders/photos"
+    assert photo_renders(tmp_path, "b", None) == tmp_path / "exports/b/renders/photos"
+    common.mkdir(parents=True)  # of an earlier version
+    assert photo_renders(tmp_path, "b", None) == common
+    (tmp_path / "exports/b/renders/photos").mkdir(parents=True)
+    assert photo_renders(tmp_path, "b", None) == tmp_path / "exports/b/renders/photos"
+    assert photo_renders(tmp_path, "main", None) == common
+    assert photo_renders(tmp_path, "b", tmp_path / "mine") == tmp_path / "mine"
 
 
 def test_a_mesh_from_before_the_project_was_aligned_anew_is_told(tmp_path):

@@ -67,11 +67,12 @@ def finish_times(
 
 
 def remaining(task: Task, durations: Durations, now: float) -> float:
-    """Seconds that are left of a task."""
+    """Seconds that are left of a task: of what its stage takes, and at least those of the part that it is at."""
     whole = durations.of(task.stage)
     if task.state != "running":
         return whole
-    elapsed = now - task.begun
-    if task.fraction > 0.05:
-        return max(0.0, elapsed / task.fraction - elapsed)
-    return max(1.0, whole - elapsed)
+    left = max(1.0, whole - (now - task.begun))
+    if task.fraction > 0.05:  # of this part
+        elapsed = now - task.part_begun
+        left = max(left, elapsed / task.fraction - elapsed)
+    return left

@@ -173,6 +173,8 @@ class Runner:
             task.node = message["node"]
             if "stage" in message:  # it works, and was not only reached
                 self.starved = 0.0
+            if message.get("stage", task.message) != task.message:
+                task.part_begun = task.heard
             task.fraction, task.message = message.get("fraction", task.fraction), message.get("stage", task.message)
         elif message["kind"] == "lost":
             self._lost(task, message["reason"])

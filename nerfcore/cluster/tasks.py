@@ -45,6 +45,7 @@ class Task:
     disks: int = 0  # workers whose disk was full
     not_before: float = 0.0  # monotonic time
     begun: float = 0.0
+    part_begun: float = 0.0  # the part of its stage that `message` names
     heard: float = 0.0
     fraction: float = 0.0
     message: str = ""
@@ -91,7 +92,7 @@ class Tasks:
         for entry in held:
             heapq.heappush(self._ready, entry)
         if found is not None:
-            found.state, found.begun, found.heard = "running", now, now
+            found.state, found.begun, found.part_begun, found.heard = "running", now, now, now
             found.fraction, found.message = 0.0, ""
         return found
 

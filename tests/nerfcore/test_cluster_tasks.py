@@ -66,8 +66,20 @@ def test_estimates_follow_what_was_measured_and_the_cores_there_are():
     tasks[0].state = "done"
     assert max(finish_times(tasks, 1, lambda t: durations.of(t.stage)).values()) == 23.0
     running = tasks[1]
-    running.state, running.begun, running.fraction = "running", 100.0, 0.5
+    running.state, running.begun, running.part_begun, running.fraction = "running", 100.0, 100.0, 0.5
     assert remaining(running, durations, 106.0) == pytest.approx(6.0)
+
+
+def test_time_left_does_not_jump_where_a_part_of_a_stage_ends():
+    durations, task = Durations({"stage0": [100.0]}), chain("a", 1)[0]
+    task.state, task.begun, left = "running", 0.0, []
+    for second in range(100):  # in two parts of 50 seconds, whose progress is told
+        task.part_begun, task.fraction = (0.0, second / 50) if second < 50 else (50.0, second / 50 - 1)
+        left.append(remaining(task, durations, float(second)))
+    assert left == pytest.approx([100.0 - second for second in range(100)])
+    # What takes longer than it did before is known from the part that it is at.
+    task.part_begun, task.fraction = 50.0, 0.25
+    assert remaining(task, durations, 150.0) == pytest.approx(300.0)
 
 
 def test_two_thousand_captures_are_planned_in_five_seconds(tmp_path):

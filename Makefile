@@ -34,7 +34,8 @@ demo: venv
 ifndef PHOTOS
 	$(BIN)/fieldwork simulate $(DEMO)/capture --overviews 14
 endif
-	rm -rf $(DEMO)/project
+	@rm -rf $(DEMO)/project || { sleep 5; rm -rf $(DEMO)/project; } || { \
+		echo "$(DEMO)/project is still being written to by a demo that was stopped: run this again when that has ended." >&2; exit 1; }
 	$(BIN)/fieldwork reconstruct "$(or $(PHOTOS),$(DEMO)/capture/photos)" --out $(DEMO)/project $(if $(PHOTOS),$(OWN),$(SIMULATED)) \
 		--time-limit $(TRAIN_SECONDS) --blend $(DEMO)/scene.blend --report $(DEMO)/report.html --renders $(DEMO)/renders
 	@echo "Look at $(DEMO)/report.html, $(DEMO)/scene.blend and $(DEMO)/renders."

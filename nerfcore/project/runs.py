@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import ProjectError
-from ..files import disk_errors, json_lines
+from ..files import disk_errors, json_lines, write_text
 from .fingerprints import digest
 
 CHECKPOINT = "field.safetensors"
@@ -208,14 +208,13 @@ def read_events(folder: Path) -> list[dict[str, Any]]:
         return []
 
 
-def cut_events(folder: Path) -> None:
-    """Take away the end of a line that was cut off, before more lines are appended. Raises DiskError."""
+def cut_events(folder: Path, steps: int) -> None:
+    """Take away what a training that was killed told of steps after its last checkpoint, which come again, and a line that was
+    cut off. Raises DiskError."""
     path = folder / EVENTS
-    with disk_errors(path):
-        if not path.is_file():
-            return
-        with open(path, "rb+") as file:
-            file.truncate(file.read().rfind(b"\n") + 1)
+    if path.is_file():
+        kept = [event for event in read_events(folder) if event.get("step", 0) <= steps]
+        write_text(path, "".join(json.dumps(event) + "\n" for event in kept))
 
 
 def read_metrics(folder: Path) -> dict[str, Any]:

@@ -90,7 +90,6 @@ def train(params: TrainParams, report: Reporter) -> dict[str, Any]:
     if place is not None:
         info, scene = resumable(place, params, report)
         saved = saved_state(place, info, device)
-        cut_events(place.folder)
     else:
         info, scene = _planned(params, device)
         place = TrainingFolder.anew(project_folder, params.run)
@@ -110,6 +109,7 @@ def train(params: TrainParams, report: Reporter) -> dict[str, Any]:
                 f"{place.folder / CHECKPOINT} holds a field of another shape than {INFO} beside it describes.",
                 "Train the run anew, without --resume.",
             ) from error
+        cut_events(place.folder, trainer.steps)
         state.update({key: saved[1].get(key) for key in state})
         trainer.largest_batch = state["largest_batch"]
         del saved

@@ -248,6 +248,19 @@ def test_a_run_that_is_not_there_does_not_go_on(project: Path, tmp_path: Path) -
     assert train(params(first, steps=2, resume=True), Reporter())["steps"] == 2
 
 
+def test_steps_that_come_again_after_a_kill_are_told_once(project: Path) -> None:
+    path = run_folder(project, "main") / runs.EVENTS
+    whole = path.read_text()
+    late = json.dumps({"step": 15, "seconds": 9.0, "loss": 1.0, "psnr": 1.0, "rays_per_second": 1})
+    path.write_text(f'{whole}{late}\n{{"step": 17, "sec')  # told after the last checkpoint, of step 12
+    train(params(project, steps=20, resume=True), Reporter())
+    assert path.read_text().startswith(whole)
+    steps = [event["step"] for event in runs.read_events(run_folder(project, "main"))]
+    assert steps == sorted(set(steps))
+    assert 15 not in steps[: whole.count("\n") + 1]
+    assert steps[-1] == 20
+
+
 def test_a_run_of_another_project_does_not_go_on(project: Path, tmp_path: Path) -> None:
     other = ball_project(tmp_path / "other")
     shutil.copytree(project / "runs", other / "runs")

@@ -109,6 +109,7 @@ def render(params: RenderParams, report: Reporter, shown: Model | BakedField | N
         shown.refine(math.inf, report.check, sparse_rays([camera for _, camera, _ in planned], poses, shown.device))
     with disk_errors(out):
         out.mkdir(parents=True, exist_ok=True)
+        parts.forget_overwritten(out, inputs, [name for name, _, _ in todo])
     colors = {c.id: c.color for c in scene.classes}
     names = {name.casefold() for name, _, _ in planned}
     frames, seconds = [path for made in kept.values() for path in made], 0.0

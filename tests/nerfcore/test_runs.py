@@ -18,7 +18,7 @@ from fieldwork.nerfcore.project.edit import region
 from fieldwork.nerfcore.project.runs import TrainingFolder, checkpoint_id, fresh_folder, run_folder, settle, swap_in
 from fieldwork.nerfcore.project.store import load_project, save_project
 from fieldwork.nerfcore.render.run import load_info, load_trained, save_info
-from fieldwork.nerfcore.render.verb import render
+from fieldwork.nerfcore.render.verb import render, rendered
 from fieldwork.nerfcore.train.reuse import finished, held_out, unfinished
 from fieldwork.nerfcore.train.verb import train
 from fieldwork.tests.nerfcore.support.ball import SMALL, ball_project
@@ -289,6 +289,36 @@ def test_photos_of_training_that_are_evaluated_say_nothing_of_the_training(proje
     (place / runs.METRICS).unlink()  # as a training that was stopped leaves it
     evaluate(asked, Reporter())
     assert unfinished(params(project)), "it goes on all the same"
+
+
+def test_pictures_that_another_render_has_overwritten_are_rendered_again(project: Path, tmp_path: Path) -> None:
+    first, second = (
+        RenderParams(project=project, out=tmp_path / "out", orbit=2, size=(8, 8), passes=passes)
+        for passes in (["rgb"], ["rgb", "depth"])
+    )
+    part = first.model_copy(update={"frame_range": (0, 0)})
+
+    class Stops(Reporter):
+        def progress(self, fraction: float, message: str = "") -> None:
+            if message == "orbit_0001":
+                raise Cancelled
+
+    render(part, Reporter())
+    render(first, Reporter())
+    assert None not in (rendered(first).result, rendered(part).result)
+    with pytest.raises(Cancelled):
+        render(second, Stops())  # its first picture is there
+    assert rendered(first).result is None
+    assert rendered(part).result is None
+    said = Noting()
+    render(first, said)
+    assert said.notes == [], "no frame is taken for one that was there already"
+    elsewhere = first.model_copy(update={"orbit": None, "test": True})
+    render(elsewhere, Reporter())
+    render(part, Reporter())
+    assert rendered(part).result is not None
+    render(elsewhere, Reporter())
+    assert rendered(part).result is not None, "its picture is not overwritten"
 
 
 def test_a_field_that_is_not_the_one_its_training_ended_with_is_not_finished(project: Path) -> None:

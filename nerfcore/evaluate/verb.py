@@ -184,7 +184,7 @@ def evaluate(params: EvaluateParams, report: Reporter) -> dict[str, Any]:
     if params.report is not None:
         check_report(params.report)
         require_writable(params.report)
-    folder = Path(params.project)
+    folder, asked = Path(params.project), time.perf_counter()
     project, trained = load_project(folder), load_trained(folder, params.run)
     scene = load_scene(folder, trained.info.holdout)
     indices = scene.test if params.split == "test" else scene.train
@@ -220,8 +220,8 @@ def evaluate(params: EvaluateParams, report: Reporter) -> dict[str, Any]:
     report.stage("Rendering held-out views" if params.split == "test" else "Rendering training views")
     begin, order = time.perf_counter(), range(len(indices)) if params.time_limit is None else spread(len(indices))
     for number, place in enumerate(order):
-        spent = time.perf_counter() - begin
-        if params.time_limit is not None and number > 0 and spent * (number + 1) / number > params.time_limit:
+        now = time.perf_counter()
+        if params.time_limit is not None and number > 0 and now - asked + (now - begin) / number > params.time_limit:
             report.note(f"{number} of {len(indices)} photos are compared: the time is used up.")
             break
         view = scene.views[indices[place]]

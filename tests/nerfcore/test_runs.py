@@ -6,11 +6,13 @@ import json
 import os
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from fieldwork.nerfcore.errors import Cancelled, DiskError, InputError, ProjectError
 from fieldwork.nerfcore.evaluate.documentation import sections
-from fieldwork.nerfcore.evaluate.verb import evaluate, evaluated
+from fieldwork.nerfcore.evaluate.verb import Comparison, evaluate, evaluated
 from fieldwork.nerfcore.params import EvaluateParams, RegionParams, RenderParams, TrainParams
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.project import runs
@@ -319,6 +321,32 @@ def test_pictures_that_another_render_has_overwritten_are_rendered_again(project
     assert rendered(part).result is not None
     render(elsewhere, Reporter())
     assert rendered(part).result is not None, "its picture is not overwritten"
+
+
+def test_the_time_of_an_evaluation_is_that_of_all_of_it(project: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = [0.0]
+
+    def now() -> float:
+        clock[0] += 1e-6
+        return clock[0]
+
+    monkeypatch.setattr("fieldwork.nerfcore.evaluate.verb.time", SimpleNamespace(perf_counter=now))
+    add = Comparison.add
+
+    def preparing(*arguments: Any, **named: Any) -> Any:
+        clock[0] += 10.0
+        return load_trained(*arguments, **named)
+
+    def slow(*arguments: Any) -> None:
+        clock[0] += 2.0
+        add(*arguments)
+
+    monkeypatch.setattr("fieldwork.nerfcore.evaluate.verb.load_trained", preparing)
+    monkeypatch.setattr(Comparison, "add", slow)
+    for seconds, compared in ((5.0, 1), (14.5, 2), (16.5, 3)):
+        asked = EvaluateParams(project=project, split="train", time_limit=seconds)
+        clock[0] = 0.0
+        assert len(evaluate(asked, Reporter())["per_image"]) == compared
 
 
 def test_a_field_that_is_not_the_one_its_training_ended_with_is_not_finished(project: Path) -> None:

@@ -120,6 +120,16 @@ def plan_run(
     return info, scene
 
 
+def without_effect(asked: RunConfig, classes: int) -> list[str]:
+    """Sentences on what was asked for and does nothing beside the other settings; `classes`: how many there are to learn."""
+    told = []
+    if asked.field.levels == 1 and asked.field.finest is not None and asked.field.branch != "implicit":
+        told.append("field.finest has no effect: with one level there are the vertices of field.coarsest alone.")
+    if asked.sampling.pdf == "literal" and not classes:
+        told.append("sampling.pdf=literal has no effect: without classes samples are spread evenly, as with uniform.")
+    return told
+
+
 def training_views(scene: Scene, config: RunConfig) -> list[int]:
     """Indices of the views to train on; `view_share` keeps an evenly spread part of them."""
     share = config.train.view_share

@@ -50,7 +50,7 @@ from .closed_picture import closed_picture, picture_closed
 from .initial_state import InitialState
 from .inputs import training_inputs, training_length
 from .pose_refinement import write_poses
-from .prepare import make_trainer, plan_run
+from .prepare import make_trainer, plan_run, without_effect
 from .results import Measured
 from .resume import place_to_resume, resumable, saved_state
 from .schedule import largest_batch
@@ -91,7 +91,7 @@ def train(params: TrainParams, report: Reporter) -> dict[str, Any]:
         info, scene = resumable(place, params, report)
         saved = saved_state(place, info, device)
     else:
-        info, scene = _planned(params, device)
+        info, scene = _planned(params, device, report)
         place = TrainingFolder.anew(project_folder, params.run)
     save_info(place.folder, info)
     for half_written in place.folder.glob(".*.safetensors"):  # by a process that was killed
@@ -143,10 +143,12 @@ def train(params: TrainParams, report: Reporter) -> dict[str, Any]:
     return result
 
 
-def _planned(params: TrainParams, device: torch.device) -> tuple[RunInfo, Scene]:
+def _planned(params: TrainParams, device: torch.device, report: Reporter) -> tuple[RunInfo, Scene]:
     """A new run with the fingerprint of its inputs, and its scene. Raises ProjectError, SettingError, TrainingError."""
     project, config = Path(params.project), make_config(params.preset, params.set)
     info, scene = plan_run(project, params.preset, config, device, params.holdout)
+    for text in without_effect(config, len(info.class_ids)):
+        report.warn(text)
     info.origin = Origin(
         project=load_project(project).uuid,
         training=uuid.uuid4().hex,

@@ -206,3 +206,18 @@ def test_the_examples_of_settings_are_settings() -> None:
     for example in examples:
         name, _, value = example.partition("=")
         make_config("draft", {name: value})
+
+
+def test_settings_that_do_nothing_beside_the_others_are_told() -> None:
+    from fieldwork.nerfcore.train.prepare import without_effect
+
+    for settings, classes, told in (
+        ({}, 0, []),
+        ({"field.levels": "1"}, 2, []),
+        ({"field.levels": "1", "field.finest": "64"}, 2, ["field.finest"]),
+        ({"field.levels": "1", "field.finest": "64", "field.branch": "implicit"}, 2, []),
+        ({"sampling.pdf": "literal"}, 2, []),
+        ({"sampling.pdf": "literal"}, 0, ["sampling.pdf=literal"]),
+    ):
+        found = without_effect(make_config("standard", settings), classes)
+        assert [text.split(" has no effect")[0] for text in found] == told

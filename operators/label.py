@@ -354,7 +354,7 @@ def cutting_out(folder: Path) -> Job | None:
     """The job that cuts something out of a photo, where nothing was drawn since it was asked for: that is what undo means."""
     jobs = [job for job in (queue.running, *queue.waiting) if job is not None and job.state != "cancelling"]
     job = next((job for job in jobs if job.verb == "assist segment" and job.project == folder), None)
-    return job if job is not None and job.params.get("drawn_on") == pending.shown(folder) else None
+    return job if job is not None and pending.is_top(folder, job.params) else None
 
 
 class FIELDWORK_OT_label_undo(Operator):
@@ -374,7 +374,7 @@ class FIELDWORK_OT_label_undo(Operator):
         folder = snapshot.folder_of(context.scene.fieldwork)
         if folder is None:
             return {"CANCELLED"}
-        job = None if pending.unfinished(folder) else cutting_out(folder)
+        job = cutting_out(folder)
         if job is not None:
             queue.cancel(job)
         else:

@@ -74,9 +74,6 @@ class FIELDWORK_OT_assist_segment(ProjectOperator):
 
     def parameters(self, context: Context) -> dict[str, Any]:
         settings = context.scene.fieldwork
-        folder = Path(self.project_path(context))
-        # Marks on their way have no revision yet: the engine looks which one is shown when it begins.
-        shown = None if pending.waiting(folder) else pending.shown(folder)
         photo = shown_photo(self.photo, context)
         class_id = None if self.void else self.class_id
         if class_id == -1:
@@ -84,7 +81,7 @@ class FIELDWORK_OT_assist_segment(ProjectOperator):
                 raise ValueError(t("Add a class first: the + beside the list of classes"))
             class_id = settings.classes[settings.class_index].id
         return {
-            "project": str(folder),
+            "project": self.project_path(context),
             "photo": photo,
             "encoder": self.path(context, "encoder"),
             "decoder": self.path(context, "decoder"),
@@ -95,8 +92,13 @@ class FIELDWORK_OT_assist_segment(ProjectOperator):
             "void": self.void,
             "author": self.value(context, "author"),
             "key": self.key,
-            "drawn_on": shown if self.drawn_on < 0 else self.drawn_on,
+            "drawn_on": None if self.drawn_on < 0 else self.drawn_on,
         }
+
+    def before(self, context: Context, params: dict[str, Any]) -> None:
+        # Where a mark is on its way, the engine looks which revision is shown when it begins.
+        if "drawn_on" not in params:
+            pending.go_on_top(Path(params["project"]), params)
 
     def after(self) -> Done:
         return marked

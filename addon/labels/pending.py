@@ -25,11 +25,12 @@ Ask = Callable[[str, dict[str, Any], Answer], object]  # verb, parameters, what 
 
 class Wish:
     """What the engine is to do with the marks of a project: `label stroke` or `label checkout`. more: the mark after it is of
-    the same step of undo."""
+    the same step of undo. above: parameters of what was asked for meanwhile, to go on top of it."""
 
     def __init__(self, folder: Path, verb: str, params: dict[str, Any], more: bool = False) -> None:
         self.folder, self.verb, self.params, self.more = folder, verb, params, more
         self.key = os.urandom(16).hex()
+        self.above: list[dict[str, Any]] = []
         self.sent = False
         self.due = 0.0  # when to send (again), by the monotonic clock
 
@@ -60,10 +61,27 @@ def mark(folder: Path, params: dict[str, Any], more: bool = False) -> Wish:
 def check_out(folder: Path, revision: int) -> None:
     """Let a revision be shown once the marks before it are taken; such a wish just before it that nobody sent is forgotten.
     One before a mark stays, for the mark was drawn on that revision."""
-    last = next((wish for wish in reversed(_wishes) if wish.folder == folder), None)
+    last = _last(folder)
     if last is not None and last.verb == "label checkout" and not last.sent:
         _wishes.remove(last)
     _wishes.append(Wish(folder, "label checkout", {"revision": revision}))
+
+
+def go_on_top(folder: Path, params: dict[str, Any]) -> None:
+    """Let parameters of `assist segment` say on which revision it was asked for: `drawn_on`, once what is on its way is taken."""
+    last = _last(folder)
+    if last is None:
+        params["drawn_on"] = shown(folder)
+    else:
+        last.above.append(params)
+
+
+def is_top(folder: Path, params: dict[str, Any]) -> bool:
+    """Whether nothing was drawn since something was asked for with these parameters."""
+    last = _last(folder)
+    if last is not None:
+        return any(params is above for above in last.above)
+    return params.get("drawn_on") == shown(folder)
 
 
 def marks_of(folder: Path) -> list[dict[str, Any]]:
@@ -147,6 +165,17 @@ def clear() -> None:
         found.clear()
 
 
+def _last(folder: Path) -> Wish | None:
+    return next((wish for wish in reversed(_wishes) if wish.folder == folder), None)
+
+
+def _remove(wish: Wish, revision: int) -> None:
+    """Forget a wish; `revision`: what was asked for on top of it goes on that one."""
+    _wishes.remove(wish)
+    for params in wish.above:
+        params["drawn_on"] = revision
+
+
 def _taker(wish: Wish) -> Answer:
     return lambda result, error: _answered(wish, result, error)
 
@@ -156,12 +185,13 @@ def _answered(wish: Wish, result: dict[str, Any] | None, error: EngineError | No
         return
     wish.sent = False
     if error is None and result is not None:
-        _wishes.remove(wish)
+        revision = int(result["revision"])
+        _remove(wish, revision)
         _errors.pop(wish.folder, None)
-        _taken.append(Taken(wish.folder, wish.verb, int(result["revision"]), wish.more))
+        _taken.append(Taken(wish.folder, wish.verb, revision, wish.more))
         return
     if error is not None:
         _errors[wish.folder] = error
         if error.kind in REFUSED:
-            _wishes.remove(wish)
+            _remove(wish, journal.shown(wish.folder))
     wish.due = time.monotonic() + RETRY

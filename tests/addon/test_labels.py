@@ -383,6 +383,52 @@ answer(seen)
     assert facts == [False, True, ["assist segment"], False, False, 1]
 
 
+def test_undo_of_what_is_being_cut_out_after_a_stroke_on_its_way_cancels_that_and_not_the_stroke(bpy_script, tmp_path):
+    facts = bpy_script(
+        SETUP
+        + """
+from fieldwork.addon.jobs.queue import queue
+from fieldwork.addon.labels import pending
+from fieldwork.nerfcore.labels.journal import append_mark, show
+from fieldwork.operators.label_models import cut_out
+folder, cancelled, answers, seen = Path(project), [], [], []
+def run(job):
+    queue.running = job
+    job.state = "running"
+def engine(verb, params, on_done):
+    values = {name: value for name, value in params.items() if name not in ("project", "revision")}
+    answers.append(lambda: on_done({"revision": append_mark(folder, values).revision}, None))
+queue.run, queue.cancel = run, lambda job: cancelled.append(job.verb)
+settings.project = project
+settings.label_encoder, settings.label_decoder, settings.class_index = "/m/e.onnx", "/m/d.onnx", 1
+def stroke():
+    pending.mark(folder, {"photo": "a", "shape": "line", "points": [[1, 1]], "width": 2.0, "class_id": 1})
+    pending.send(engine)
+def undo():
+    before = len(cancelled)
+    bpy.ops.fieldwork.label_undo()
+    return len(cancelled) > before
+stroke()
+cut_out(settings, folder, "a", [(10.5, 20.0)])
+seen.append(undo())  # while the engine has not answered
+answers.pop(0)()
+seen.append(undo())  # before it is a step
+pending.take()
+seen += [queue.running.params["drawn_on"], undo()]
+stroke()
+seen.append(undo())  # drawn later
+answers.pop(0)()
+pending.take()
+seen.append(bpy.ops.fieldwork.label_undo.poll())  # Blender undoes it
+show(folder, 1)
+seen.append(undo())
+answer(seen)
+""",
+        project=project_without_marks(tmp_path / "p"),
+    )
+    assert facts == [True, True, 1, True, False, False, True]
+
+
 def project_without_marks(folder: Path) -> Path:
     project_with_labels(folder)
     for path in (folder / "marks").iterdir():
@@ -471,7 +517,7 @@ from fieldwork.addon.labels import pending
 from fieldwork.operators.label_models import cut_out
 asked = []
 def run(job):
-    asked.append([job.verb, job.params])
+    asked.append([job.verb, dict(job.params)])
     job.state, job.result = "done", {"revision": 7}
     if job.on_done:
         job.on_done(job)

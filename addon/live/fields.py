@@ -61,20 +61,20 @@ Is = Callable[[Any], bool]
 
 
 def parts(objects: Iterable[bpy.types.Object], is_shown: Is, is_hidden: Is, known: Inside | None = None) -> list[Part]:
-    """The fields of some objects that are shown, each with the copies of its things, also those in collections of which objects
-    are instances; copies of a field that is hidden are shown.
+    """The fields and the copies of things among some objects that are shown, also those in collections of which objects are
+    instances; copies are shown wherever their field is, hidden or in no instance too.
 
     Args:
         is_shown: of the objects. is_hidden: whether an object or a collection that is in an instance is shown by none.
         known: of collections that were looked into.
     """
     known = {} if known is None else known
-    empties, found = [obj for obj in objects if obj.type == "EMPTY"], []
-    copied = [obj for obj in empties if obj.fieldwork_copy.thing]
-    for field in field_objects(empties):
-        placed = [None] if is_shown(field) else []
-        placed += [copy for copy in things.copies(field, copied) if is_shown(copy)]
-        found += [Part(field, copy) for copy in placed]
+    empties = [obj for obj in objects if obj.type == "EMPTY"]
+    found = [Part(field, None) for field in field_objects(empties) if is_shown(field)]
+    for copy in empties:
+        field = things.field_of(copy)
+        if field is not None and is_shown(copy) and is_there(field):
+            found.append(Part(field, copy))
     for empty in empties:
         collection = empty.instance_collection if empty.instance_type == "COLLECTION" else None
         if collection is None:
@@ -220,10 +220,13 @@ def crop_box(own: Any) -> bpy.types.Object | None:
     """The box that a field object is cut to; None where it has none."""
     if own.crop is None:
         return None
-    # A deleted object lives on as long as something points to it; one in a collection of instances is in no scene.
-    box = own.crop.original
-    there = box.users_scene or any(held.users > held.use_fake_user for held in box.users_collection)
-    return own.crop if there else None
+    return own.crop if is_there(own.crop.original) else None
+
+
+def is_there(obj: bpy.types.Object) -> bool:
+    """Whether an object is not deleted: such a one lives on as long as something points to it. One in a collection of instances
+    is in no scene."""
+    return bool(obj.users_scene) or any(held.users > held.use_fake_user for held in obj.users_collection)
 
 
 def crop_matrix(crop: bpy.types.Object) -> Matrix:

@@ -59,13 +59,14 @@ def look_of_copies(obj: bpy.types.Object, thing: str) -> dict[str, dict[str, Any
 def copies(field: bpy.types.Object, objects: Iterable[bpy.types.Object]) -> list[bpy.types.Object]:
     """Those of the objects that are copies of things of a field."""
     original = field.original
-    return [
-        obj
-        for obj in objects
-        if obj.fieldwork_copy.thing
-        and obj.fieldwork_copy.field is not None
-        and obj.fieldwork_copy.field.original == original
-    ]
+    return [obj for obj in objects if field_of(obj) == original]
+
+
+def field_of(copy: bpy.types.Object) -> bpy.types.Object | None:
+    """The field of whose thing an object is a copy; None where it is none."""
+    own = copy.fieldwork_copy
+    there = own.thing and own.field is not None and own.field.type == "EMPTY" and own.field.fieldwork.is_field
+    return own.field.original if there else None
 
 
 def scene_from_capture(copy: bpy.types.Object) -> Matrix:

@@ -75,6 +75,28 @@ answer(facts)
     assert facts["without the drawer"] == [copy], "as copies of a field that is hidden in the scene itself"
 
 
+def test_copies_in_instances_are_shown_where_their_field_is_in_the_scene_itself(bpy_script, tmp_path: Path) -> None:
+    facts = bpy_script(
+        SETUP
+        + NESTED
+        + """
+drawer.objects.unlink(field)
+scene.collection.objects.link(field)
+def names():
+    bpy.context.view_layer.update()
+    return sorted(part.name for part in fields.rendered_parts(bpy.context.evaluated_depsgraph_get()))
+facts = [names()]
+parts = {part.name: part for part in fields.all_parts(scene)}
+facts.append(fields.poses_of_part(parts["Beside\\nCopy"])["scene_from_capture"][0][3])
+scene.collection.objects.unlink(field)
+facts.append(names())
+answer(facts)
+""",
+        project=make_project(tmp_path / "capture"),
+    )
+    assert facts == [["Beside\nCopy", "Field", "High\nLow\nCopy"], 12.0, []], "deleted fields have no copies"
+
+
 def test_the_viewport_has_them_in_the_same_places(bpy_script, tmp_path: Path) -> None:
     facts = bpy_script(
         SETUP

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -38,6 +39,17 @@ def triangles(depsgraph: Any) -> Triangles:
         holdout.append(np.full(len(faces[-1]), is_holdout(instance, depsgraph.view_layer)))
         count += len(vertices[-1])
     return Triangles(np.concatenate(vertices), np.concatenate(faces), np.concatenate(holdout))
+
+
+def with_instances(objects: Iterable[Any], looked_into: set[Any] | None = None) -> Iterator[Any]:
+    """Objects, and those of the collections of which they are instances."""
+    looked_into = set() if looked_into is None else looked_into
+    for obj in objects:
+        yield obj
+        collection = obj.instance_collection if obj.instance_type == "COLLECTION" else None
+        if collection is not None and collection not in looked_into:
+            looked_into.add(collection)
+            yield from with_instances(collection.all_objects, looked_into)
 
 
 def mesh_of(obj: Any) -> tuple[np.ndarray, np.ndarray]:

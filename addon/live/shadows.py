@@ -14,7 +14,7 @@ from ..errors import SceneError
 from ..roles import ROLE
 from ..scene.visibility import is_surface
 from ..text import t
-from .objects import SOLID
+from .objects import SOLID, with_instances
 from .shared_scene import filter_width, scene_of, share
 
 PASS = "Shadow Catcher"
@@ -23,13 +23,19 @@ SAMPLES = 64
 
 
 def surfaces(scene: bpy.types.Scene) -> list[bpy.types.Object]:
-    """The surfaces of captures in a scene, whole or by class or instance."""
-    return [obj for obj in scene.objects if obj.type == "MESH" and is_surface(obj)]
+    """The surfaces of captures in a scene, whole or by class or instance, also those in instances of collections."""
+    return [obj for obj in with_instances(scene.objects) if obj.type == "MESH" and is_surface(obj)]
 
 
 def catch(scene: bpy.types.Scene) -> None:
-    """Let the surfaces of a scene catch shadows."""
+    """Let the surfaces of a scene catch shadows. Raises SceneError: one is another file's, which says that it catches none."""
     for obj in surfaces(scene):
+        if obj.library is not None:
+            if not obj.is_shadow_catcher:
+                raise SceneError(
+                    t("The surface “{}” is linked: press Catch Shadows in {}.", obj.name, obj.library.filepath)
+                )
+            continue
         obj.is_shadow_catcher, obj.is_holdout, obj.hide_render = True, False, False
         for slot in obj.material_slots:
             if slot.material is not None and slot.material.use_nodes:
@@ -60,7 +66,7 @@ def set_up(scene: bpy.types.Scene) -> bpy.types.Scene | None:
     """The scene whose first view layer has the pass of the shadows, which is made where it is not there; None: nothing catches
     any. Raises SceneError: there is no Cycles."""
     own = scene.render.engine == "CYCLES"
-    if not any(_catches(obj) for obj in (scene.objects if own else surfaces(scene))):
+    if not any(_catches(obj) for obj in (with_instances(scene.objects) if own else surfaces(scene))):
         return None
     if not hasattr(scene, "cycles"):
         raise SceneError(t("Only Cycles makes shadows on the field: enable the add-on Cycles Render Engine."))
@@ -87,7 +93,7 @@ def _hold_out(layer: Any, held: bool) -> None:
     """Make the collections of a view layer that hold catching surfaces, and else nothing but what belongs to captures,
     holdouts, or no holdouts any more."""
     for child in layer.children:
-        solid = [obj for obj in child.collection.all_objects if obj.type in SOLID]
+        solid = [obj for obj in with_instances(child.collection.all_objects) if obj.type in SOLID]
         if any(is_surface(obj) and _catches(obj) for obj in solid) and all(ROLE in obj for obj in solid):
             child.holdout = held
         else:

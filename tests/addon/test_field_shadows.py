@@ -23,6 +23,55 @@ scene.cycles.samples = 64
 """
 
 
+def test_surfaces_in_instances_catch_shadows(bpy_script, tmp_path):
+    """Those that another file has are that file's to change: a sentence says so."""
+    facts = bpy_script(
+        """
+import fieldwork
+fieldwork.register()
+from fieldwork.addon.errors import SceneError
+from fieldwork.addon.live import shadows
+scene = bpy.context.scene
+def instance(collection):
+    held = bpy.data.collections.new("held")
+    scene.collection.children.link(held)
+    empty = bpy.data.objects.new("empty", None)
+    empty.instance_type, empty.instance_collection = "COLLECTION", collection
+    held.objects.link(empty)
+    return held
+surface = bpy.data.objects.new("surface", bpy.data.meshes.new("surface"))
+surface["fieldwork_role"] = "mesh"
+inner, outer = (bpy.data.collections.new(name) for name in ("inner", "outer"))
+inner.objects.link(surface)
+outer.objects.link(bpy.data.objects.new("inside", None))
+outer.objects["inside"].instance_type, outer.objects["inside"].instance_collection = "COLLECTION", inner
+held = instance(outer)
+scene.render.engine = "BLENDER_EEVEE"
+shadows.catch(scene)
+made = shadows.set_up(scene)
+layer = bpy.context.view_layer.layer_collection.children[held.name]
+facts = [surface.is_shadow_catcher, made.view_layers[0].cycles.use_pass_shadow_catcher, layer.holdout]
+surface.is_shadow_catcher = False
+bpy.data.libraries.write(f"{folder}/other.blend", {inner})
+for collection in (inner, outer, held):
+    bpy.data.collections.remove(collection)
+bpy.data.objects.remove(surface)
+with bpy.data.libraries.load(f"{folder}/other.blend", link=True) as (there, linked):
+    linked.collections = ["inner"]
+instance(linked.collections[0])
+try:
+    shadows.catch(scene)
+except SceneError as error:
+    facts.append(str(error))
+answer(facts)
+""",
+        folder=tmp_path,
+    )
+    assert facts[:3] == [True, True, True]
+    assert "“surface” is linked" in facts[3]
+    assert "other.blend" in facts[3]
+
+
 @pytest.mark.slow
 def test_shadows_of_objects_lie_on_the_field(bpy_script, ball, tmp_path):
     """The surface of the capture as a shadow catcher: a roof over the right half of the ball darkens that half only."""

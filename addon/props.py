@@ -28,3 +28,9 @@ def StringProperty(
     if subtype in PATHS and blend_relative and bpy.app.version >= (4, 5, 0):  # all paths may in older ones
         options = {*options, "PATH_SUPPORTS_BLEND_RELATIVE"}
     return bpy.props.StringProperty(subtype=subtype, options=set(options), translation_context=CONTEXT, **more)
+
+
+def CheckExisting() -> Any:
+    """Of an operator that writes the file it has Blender ask for: the file browser warns of one that is there already."""
+    return BoolProperty(name="Check Existing", description="Warn of a file that is there already", default=True,
+                        options={"HIDDEN", "SKIP_SAVE"})  # fmt: skip

@@ -4,8 +4,9 @@ Modules with properties of operators do without `from __future__ import annotati
 and Blender would compile the text of each annotation, of base classes for each operator anew.
 """
 
+import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -119,6 +120,14 @@ def same_verb_active(verb: str, context: Context) -> str | None:
 def absolute(path: str) -> str | None:
     """A path as the user gave it, absolute; None when it is empty."""
     return str(paths.absolute(path)) if path else None
+
+
+def with_suffix(path: str, suffix: str, others: Collection[str] = ()) -> str:
+    """A path that ends in a suffix, in place of one of the others if it has that."""
+    head, end = os.path.splitext(path)
+    if not os.path.basename(path) or end.lower() == suffix:
+        return path
+    return (head if end.lower() in others else path) + suffix
 
 
 class VerbOperator(Operator):

@@ -1,14 +1,13 @@
 """Labels from and for other labelling tools."""
 
-from pathlib import Path
 from typing import Any
 
 from bpy.types import Context, Event
 
 from ..addon.jobs.job import Done, Job
-from ..addon.props import BoolProperty, EnumProperty, IntProperty, StringProperty
+from ..addon.props import BoolProperty, CheckExisting, EnumProperty, IntProperty, StringProperty
 from ..addon.text import t
-from .base import ProjectOperator, absolute, need_project, refresh_scenes, scene_settings
+from .base import ProjectOperator, absolute, need_project, refresh_scenes, scene_settings, with_suffix
 
 TOOLS = [
     ("coco", "COCO", "Instances as polygons or run lengths, one .json file"),
@@ -97,6 +96,15 @@ class FIELDWORK_OT_label_export(ProjectOperator):
         options={"SKIP_SAVE"},
     )  # fmt: skip
 
+    check_existing: CheckExisting()
+
+    def check(self, context: Context) -> bool:
+        before, self.filepath = self.filepath, self._named(self.filepath)
+        return self.filepath != before  # the file browser then knows which file it is
+
+    def _named(self, path: str) -> str:
+        return with_suffix(path, SUFFIXES.get(self.format, ""), SUFFIXES.values())
+
     def invoke(self, context: Context, event: Event) -> set[str]:
         self.filepath = "labels"
         context.window_manager.fileselect_add(self)
@@ -106,13 +114,11 @@ class FIELDWORK_OT_label_export(ProjectOperator):
         path = absolute(self.filepath)
         if path is None:
             raise ValueError(t("Choose a file or folder to write."))
-        suffix, settings = SUFFIXES.get(self.format, ""), context.scene.fieldwork
-        if suffix and Path(path).suffix.lower() != suffix:
-            path += suffix
+        settings = context.scene.fieldwork
         chosen = settings.classes[settings.class_index].name if settings.class_index < len(settings.classes) else ""
         return {
             "project": self.project_path(context),
-            "out": path,
+            "out": self._named(path),
             "format": self.format,
             "source": self.source,
             "run": self.value(context, "run"),

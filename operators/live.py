@@ -9,11 +9,11 @@ from ..addon import paths
 from ..addon.errors import SceneError
 from ..addon.live import fields, things
 from ..addon.project import snapshot
-from ..addon.props import BoolProperty, IntProperty, StringProperty
+from ..addon.props import BoolProperty, CheckExisting, IntProperty, StringProperty
 from ..addon.roles import is_local
 from ..addon.scene.frame import root_of, scene_from_capture
 from ..addon.text import t
-from .base import need_run
+from .base import need_run, with_suffix
 
 
 def active_field(context: Context) -> bpy.types.Object | None:
@@ -186,6 +186,11 @@ class FIELDWORK_OT_save_field_edits(_OfField):
 
     filepath: StringProperty(name="File", description="File to write", subtype="FILE_PATH", options={"SKIP_SAVE"})
     filter_glob: StringProperty(default="*.json", options={"HIDDEN"})
+    check_existing: CheckExisting()
+
+    def check(self, context: Context) -> bool:
+        before, self.filepath = self.filepath, with_suffix(self.filepath, ".json")
+        return self.filepath != before  # the file browser then knows which file it is
 
     def invoke(self, context: Context, event: bpy.types.Event) -> set[str]:
         self.filepath = self.filepath or "edits.json"
@@ -196,12 +201,14 @@ class FIELDWORK_OT_save_field_edits(_OfField):
         from ..nerfcore.errors import FieldworkError  # not at the top: enabling the extension must be quick
         from ..nerfcore.files import write_json
 
+        path = paths.absolute(with_suffix(self.filepath, ".json"))
         found = things.edits(active_field(context), context.view_layer.objects)
         try:
-            write_json(paths.absolute(self.filepath), {"version": 1, "edits": found})
+            write_json(path, {"version": 1, "edits": found})
         except FieldworkError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
+        self.report({"INFO"}, t("The edits of the field are at {}.", path))
         return {"FINISHED"}
 
 

@@ -508,6 +508,36 @@ answer([seen, asked])
     assert (masks.out, masks.class_name, masks.revision) == (Path("/data/masks"), "gold", 2)
 
 
+def test_the_file_browser_warns_of_files_that_are_there(bpy_script):
+    """It looks for the name that is shown, which therefore ends as the file will."""
+    facts = bpy_script(
+        SETUP
+        + """
+from types import SimpleNamespace
+from fieldwork.operators.label_files import FIELDWORK_OT_label_export as Export
+from fieldwork.operators.live import FIELDWORK_OT_save_field_edits as Save
+own = bpy.ops.fieldwork
+facts = [each.get_rna_type().properties["check_existing"].default for each in (own.label_export, own.save_field_edits)]
+own = SimpleNamespace(filepath="/data/labels", format="coco")
+own._named = lambda path: Export._named(own, path)
+for format in ("coco", "cvat", "masks", "masks"):
+    own.format = format
+    facts.append([Export.check(own, None), own.filepath])
+own.filepath = "/data/edits"
+facts += [[Save.check(own, None), own.filepath], [Save.check(own, None), own.filepath]]
+answer(facts)
+"""
+    )
+    assert facts[:2] == [True, True]
+    assert facts[2:6] == [
+        [True, "/data/labels.json"],
+        [True, "/data/labels.xml"],
+        [True, "/data/labels"],
+        [False, "/data/labels"],
+    ]
+    assert facts[6:] == [[True, "/data/edits.json"], [False, "/data/edits.json"]]
+
+
 def test_clicks_and_boxes_go_to_the_model_and_come_back_as_marks(bpy_script, tmp_path):
     facts = bpy_script(
         SETUP

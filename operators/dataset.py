@@ -94,10 +94,10 @@ class FIELDWORK_OT_dataset(VerbOperator):
         column.separator()
         for name in ("labels", "size", "samples", "depth", "transparent", "make_project"):
             column.prop(self, name)
-        render = context.scene.render
         if not all(self.size):
-            percent = render.resolution_percentage / 100
-            size = (round(render.resolution_x * percent), round(render.resolution_y * percent))
+            from ..addon.scene.lens import picture_size  # not at the top: enabling the extension must be quick
+
+            size = picture_size(context.scene.render)
             column.label(text=t("{} × {} pixels, as set in Output Properties", *size), icon="INFO")
 
     def parameters(self, context: Context) -> dict[str, Any]:

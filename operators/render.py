@@ -44,12 +44,12 @@ def write_cameras(
 
     Where the capture of a project was moved in the scene, the camera is taken as it stands to the capture.
     """
-    from ..nerfcore.files import write_json  # not at the top: enabling the extension must be quick
+    # Not at the top: enabling the extension must be quick.
+    from ..addon.scene.lens import picture_size
+    from ..nerfcore.files import write_json
 
     place, render = Held(bpy.data.scenes, scene), scene.render
-    # As Blender: 33 % of 1920 pixels are 633, not 634.
-    width = size[0] or render.resolution_x * render.resolution_percentage // 100
-    height = size[1] or render.resolution_y * render.resolution_percentage // 100
+    width, height = (own or seen for own, seen in zip(size, picture_size(render)))
     numbers = [scene.frame_current]
     if animated:
         numbers = list(range(scene.frame_start, scene.frame_end + 1, scene.frame_step))

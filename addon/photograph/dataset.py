@@ -12,7 +12,7 @@ import numpy as np
 from mathutils import Matrix
 
 from ..errors import SceneError
-from ..scene.lens import pinhole
+from ..scene.lens import picture_size, pinhole
 from .orbit import look_at, sphere
 from .shoot import Lens, Shot, class_ids, has_denoiser, photograph
 
@@ -81,12 +81,7 @@ def plan(scene: bpy.types.Scene, request: dict[str, Any]) -> list[Shot]:
 
 
 def scene_size(scene: bpy.types.Scene, size: list[int] | None) -> tuple[int, int]:
-    if size is not None:
-        return size[0], size[1]
-    render = scene.render
-    return tuple(
-        max(1, side * render.resolution_percentage // 100) for side in (render.resolution_x, render.resolution_y)
-    )
+    return (size[0], size[1]) if size is not None else picture_size(scene.render)
 
 
 def scene_lens(scene: bpy.types.Scene, size: list[int] | None) -> Lens:

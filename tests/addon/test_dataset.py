@@ -311,6 +311,28 @@ def test_the_operator_photographs_the_scene_as_it_is_and_makes_a_project(blend, 
     assert len(load_scene(tmp_path / "set_fieldwork").views) == 3
 
 
+def test_the_dialog_says_the_size_that_photos_get(bpy_script):
+    """33 % of 1920 pixels are 633, as Blender has it."""
+    facts = bpy_script(
+        """
+from types import SimpleNamespace
+from unittest.mock import MagicMock
+import fieldwork
+fieldwork.register()
+from fieldwork.addon.photograph.dataset import scene_size
+from fieldwork.operators.dataset import FIELDWORK_OT_dataset
+render, layout = bpy.context.scene.render, MagicMock()
+render.resolution_x, render.resolution_y, render.resolution_percentage = 1920, 1081, 33
+own = SimpleNamespace(layout=layout, path_kind="camera", size=(0, 0))
+FIELDWORK_OT_dataset.draw(own, bpy.context)
+told = layout.column().label.call_args.kwargs["text"]
+answer([told, scene_size(bpy.context.scene, None)])
+"""
+    )
+    assert facts[1] == [633, 356]
+    assert facts[0].startswith("633 × 356 pixels")
+
+
 def test_a_scene_in_centimetres_becomes_a_data_set_in_metres(blend, tmp_path, bpy_script):
     """Lengths of the scene, times the scale of its units: here the cube of one unit has a side of one centimetre."""
     small = tmp_path / "small.blend"

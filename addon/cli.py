@@ -10,6 +10,7 @@ import subprocess
 import sys
 
 from . import machine
+from .engine.in_use import used
 from .engine.link import engine_environment
 
 NO_ENGINE = "The engine is not installed. Install it in the preferences of Fieldwork, or set FIELDWORK_ENGINE_PYTHON."
@@ -22,7 +23,9 @@ def main(arguments: list[str]) -> int:
         print(NO_ENGINE, file=sys.stderr)
         return 1
     # Ctrl-C reaches both processes: the engine's ends its work in order, and this one must wait for it.
-    process = subprocess.Popen([str(python), "-s", "-m", "nerfcore", *arguments], env=engine_environment())
+    with used(python) as held:
+        command = [str(python), "-s", "-m", "nerfcore", *arguments]
+        process = subprocess.Popen(command, env=engine_environment(), **held)
     # What ends Blender, as a farm does, must end the engine too.
     handlers = {signal.SIGINT: signal.SIG_IGN, signal.SIGTERM: lambda *_: process.terminate()}
     before = {number: signal.signal(number, handler) for number, handler in handlers.items()}

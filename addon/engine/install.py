@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import EngineError
+from .in_use import is_used
 from .link import Link
 from .only_one import forget, only_one
 from .place import (
@@ -50,8 +51,10 @@ class Options:
 
 
 def remove(folder: Path) -> None:
-    """Remove the engine and its downloads. Raises InstallError while another Blender installs it, or runs it on Windows."""
+    """Remove the engine and its downloads. Raises InstallError while another Blender installs it, or something runs on it."""
     with only_one(folder):
+        for name in ENVIRONMENTS:
+            _check_unused(folder / name, "Remove")
         for name in (COMPLETE, STAGING):
             (folder / name).unlink(missing_ok=True)
         places = [folder / name for name in (*ENVIRONMENTS, *DOWNLOADS)]
@@ -60,6 +63,14 @@ def remove(folder: Path) -> None:
         for place in places:
             if place.exists() and not place.is_symlink():
                 raise InstallError(f"{place} is in use. Close other Blenders, then press Remove again.")
+
+
+def _check_unused(venv: Path, button: str) -> None:
+    if is_used(venv):
+        raise InstallError(
+            f"The engine in {venv} runs for another Blender, or for a job that goes on without one. Wait until that has "
+            f"ended, or stop it, then press {button} again."
+        )
 
 
 def install(options: Options, report: Report, cancelled: threading.Event, lock: Path = LOCK) -> dict[str, Any]:
@@ -101,7 +112,7 @@ def _install(options: Options, report: Report, cancelled: threading.Event, lock:
     temporary.write_text(json.dumps(text, indent=1), encoding="utf-8")
     os.replace(temporary, folder / COMPLETE)
     (folder / STAGING).unlink(missing_ok=True)
-    if before != venv:
+    if before != venv and not is_used(before):  # else it is left for the next time: jobs that run on it go on
         forget(before)
     report(1.0, "The engine is installed")
     return result
@@ -114,6 +125,7 @@ def _make_environment(options: Options, venv: Path, uv: Path | None, run: Runner
     if read_json(note) == made and python_in(venv).is_file():
         return
     run.report(0.08, "Making the environment")
+    _check_unused(venv, "Repair")
     note.unlink(missing_ok=True)
     shutil.rmtree(venv, ignore_errors=True)
     if venv.exists():

@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import EngineError
+from .in_use import used
 from .place import ROOT, tail
 
 # Lines of a log that say why a process ended.
@@ -100,7 +101,7 @@ class Link:
         if sys.platform == "win32":
             options = {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP | subprocess.CREATE_NO_WINDOW}
         try:
-            with open(self.log, "wb") as log:
+            with open(self.log, "wb") as log, used(self.python) as held:
                 process: Any = subprocess.Popen(  # of bytes, which options by name do not tell a type checker
                     self.command,
                     stdin=subprocess.PIPE,
@@ -109,6 +110,7 @@ class Link:
                     env=engine_environment(),
                     cwd=str(self.log.parent),
                     **options,
+                    **held,
                 )
         except OSError as error:
             raise EngineError(

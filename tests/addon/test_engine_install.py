@@ -17,6 +17,7 @@ import pytest
 from fieldwork.addon.engine import install as module
 from fieldwork.addon.engine import place, tools
 from fieldwork.addon.engine.install import InstallCancelled, InstallError, Options, install
+from fieldwork.addon.engine.link import Link
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -501,6 +502,32 @@ def test_one_installation_at_a_time(options, lock, tmp_path, content_doctor):
             other.kill()
     go(options, lock)
     assert place.installed(options.folder)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows removes nothing in which a program runs")
+def test_what_an_engine_runs_on_is_not_removed(options, lock, tmp_path, content_doctor):
+    """Also not where the Blender that started it is gone; a repair leaves it in its place until the next one."""
+    make_wheel(tmp_path / "wheels")
+    go(options, lock)
+    first, second = (options.folder / name for name in place.ENVIRONMENTS)
+    engine = Link(module.python_in(first), tmp_path / "log", [sys.executable, "-c", "import sys; sys.stdin.read()"])
+    engine.start()
+    try:
+        with pytest.raises(InstallError, match="runs for another Blender"):
+            module.remove(options.folder)
+        assert place.installed(options.folder)
+        go(options, lock)
+        assert place.environment(options.folder) == second
+        subprocess.run([module.python_in(first), "-c", "import tiny"], check=True)
+        with pytest.raises(InstallError, match="press Repair again"):
+            go(options, lock)
+    finally:
+        engine.close()
+    go(options, lock)
+    assert place.environment(options.folder) == first
+    assert not second.exists()
+    module.remove(options.folder)
+    assert not first.exists()
 
 
 def test_an_engine_installed_before_there_were_two_places_is_found(options):

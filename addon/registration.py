@@ -22,6 +22,7 @@ MODULES = (
     "addon.properties",
     "addon.live.settings",
     "addon.live.engine",
+    "addon.live.index",
     "addon.live.hint",
     "addon.live.views",
     "addon.live.in_step",

@@ -7,7 +7,7 @@ from bpy.types import Context, Operator
 
 from ..addon import paths
 from ..addon.errors import SceneError
-from ..addon.live import fields, things
+from ..addon.live import fields, index, things
 from ..addon.project import snapshot
 from ..addon.props import BoolProperty, CheckExisting, IntProperty, StringProperty
 from ..addon.roles import is_local
@@ -21,7 +21,7 @@ def active_field(context: Context) -> bpy.types.Object | None:
     obj = context.object
     if obj is not None and obj.fieldwork.is_field:
         return obj
-    found = fields.field_objects(context.scene.objects)
+    found = fields.field_objects(index.current().in_scene(context.scene))
     return found[0] if len(found) == 1 else None
 
 

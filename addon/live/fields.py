@@ -15,7 +15,7 @@ from ..project import snapshot
 from ..roles import is_local
 from ..scene.frame import scene_from_capture
 from ..text import t
-from . import things
+from . import index, things
 
 
 def field_objects(objects: Iterable[bpy.types.Object]) -> list[bpy.types.Object]:
@@ -60,52 +60,49 @@ Inside = dict[bpy.types.Collection, list[Part]]
 Is = Callable[[Any], bool]
 
 
-def parts(objects: Iterable[bpy.types.Object], is_shown: Is, is_hidden: Is, known: Inside | None = None) -> list[Part]:
-    """The fields and the copies of things among some objects that are shown, also those in collections of which objects are
-    instances; copies are shown wherever their field is, hidden or in no instance too.
+def parts(found: index.Index, is_shown: Is, is_hidden: Is) -> list[Part]:
+    """The fields and the copies of things of the file that are shown, also those in collections of which objects are instances;
+    copies are shown wherever their field is, hidden or in no instance too.
 
     Args:
-        is_shown: of the objects. is_hidden: whether an object or a collection that is in an instance is shown by none.
-        known: of collections that were looked into.
+        is_shown: of the objects of the index. is_hidden: whether an object or a collection that is in an instance is shown by
+            none.
     """
-    known = {} if known is None else known
-    empties = [obj for obj in objects if obj.type == "EMPTY"]
-    found = [Part(field, None) for field in field_objects(empties) if is_shown(field)]
-    for copy in empties:
-        field = things.field_of(copy)
-        if field is not None and is_shown(copy) and is_there(field):
-            found.append(Part(field, copy))
-    for empty in empties:
-        collection = empty.instance_collection if empty.instance_type == "COLLECTION" else None
+    return _parts([obj for obj in found.objects if is_shown(obj)], found, is_hidden, {})
+
+
+def _parts(objects: Iterable[bpy.types.Object], found: index.Index, is_hidden: Is, known: Inside) -> list[Part]:
+    """Those of some objects that are shown. known: of collections that were looked into."""
+    shown: list[Part] = []
+    for obj in objects:
+        if obj.fieldwork.is_field:
+            shown.append(Part(obj, None))
+        field = things.field_of(obj)
+        if field is not None and field in found.placed:
+            shown.append(Part(field, obj))
+        collection = obj.instance_collection if obj.instance_type == "COLLECTION" else None
         if collection is None:
             continue
         if collection not in known:
             known[collection] = []  # one that holds an instance of itself shows nothing more by it
-            inside = shown_inside(collection, is_hidden)
-            known[collection] = parts(collection.all_objects, inside.__contains__, is_hidden, known)
-        if known[collection] and is_shown(empty):
-            found += [part._replace(instancers=(empty, *part.instancers)) for part in known[collection]]
-    return found
-
-
-def shown_inside(collection: bpy.types.Collection, is_hidden: Is) -> set[bpy.types.Object]:
-    """The objects that an instance of a collection shows."""
-    if is_hidden(collection):
-        return set()
-    own = {obj for obj in collection.objects if not is_hidden(obj)}
-    return own.union(*(shown_inside(child, is_hidden) for child in collection.children))
+            known[collection] = _parts(index.inside(collection, found.held, is_hidden), found, is_hidden, known)
+        shown += [part._replace(instancers=(obj, *part.instancers)) for part in known[collection]]
+    return shown
 
 
 def seen_parts(layer: bpy.types.ViewLayer, space: bpy.types.SpaceView3D) -> list[Part]:
     """Those that a 3D viewport shows."""
     return parts(
-        layer.objects, lambda obj: obj.visible_get(view_layer=layer, viewport=space), lambda item: item.hide_viewport
+        index.current(),
+        lambda obj: obj.visible_get(view_layer=layer, viewport=space),
+        lambda item: item.hide_viewport,
     )
 
 
 def all_parts(scene: bpy.types.Scene) -> list[Part]:
     """Those of a scene, shown or not."""
-    return parts(scene.objects, lambda _: True, lambda _: False)
+    found = index.current()
+    return parts(found, found.in_scene(scene).__contains__, lambda _: False)
 
 
 def rendered_parts(depsgraph: bpy.types.Depsgraph) -> list[Part]:
@@ -115,7 +112,7 @@ def rendered_parts(depsgraph: bpy.types.Depsgraph) -> list[Part]:
     def is_hidden(item: bpy.types.Object | bpy.types.Collection) -> bool:
         return item.evaluated_get(depsgraph).hide_render
 
-    return parts(depsgraph.view_layer.objects, lambda obj: obj.name_full in rendered and not is_hidden(obj), is_hidden)
+    return parts(index.current(), lambda obj: obj.name_full in rendered and not is_hidden(obj), is_hidden)
 
 
 def in_rendered_collections(layer: bpy.types.LayerCollection) -> set[str]:
@@ -220,13 +217,7 @@ def crop_box(own: Any) -> bpy.types.Object | None:
     """The box that a field object is cut to; None where it has none."""
     if own.crop is None:
         return None
-    return own.crop if is_there(own.crop.original) else None
-
-
-def is_there(obj: bpy.types.Object) -> bool:
-    """Whether an object is not deleted: such a one lives on as long as something points to it. One in a collection of instances
-    is in no scene."""
-    return bool(obj.users_scene) or any(held.users > held.use_fake_user for held in obj.users_collection)
+    return own.crop if own.crop.original in index.current().placed else None
 
 
 def crop_matrix(crop: bpy.types.Object) -> Matrix:

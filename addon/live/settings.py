@@ -16,6 +16,7 @@ from ..props import (
     StringProperty,
 )
 from ..text import t
+from . import index
 from .redraw import redraw_views
 
 SOURCES = [
@@ -35,6 +36,12 @@ def _changed(self: PropertyGroup, context: Context) -> None:
     """What the viewport shows has changed."""
     if not bpy.app.background:
         redraw_views()
+
+
+def _counts_otherwise(self: PropertyGroup, context: Context) -> None:
+    """The object became what views look for, or is it no more."""
+    index.forget()
+    _changed(self, context)
 
 
 OVERRIDABLE = {"LIBRARY_OVERRIDABLE"}  # where the object is linked from another file
@@ -104,8 +111,8 @@ class FieldworkThingCopy(PropertyGroup):
     """What an object says of a thing that is shown where it stands: the field, the thing's name, and the place of the
     thing in the capture's own frame that lies on the object's origin."""
 
-    field: PointerProperty(type=bpy.types.Object)
-    thing: StringProperty()
+    field: PointerProperty(type=bpy.types.Object, update=_counts_otherwise)
+    thing: StringProperty(update=_counts_otherwise)
     center: FloatVectorProperty(subtype="XYZ")
 
 
@@ -116,7 +123,7 @@ def _is_crop_box(self: PropertyGroup, obj: bpy.types.Object) -> bool:
 class FieldworkField(PropertyGroup):
     """A field in the scene: its object, an empty, says where it lies."""
 
-    is_field: BoolProperty()
+    is_field: BoolProperty(update=_counts_otherwise)
     project: StringProperty(
         name="Project", description="Project folder of the field", subtype="DIR_PATH", update=_project_changed
     )
@@ -130,7 +137,7 @@ class FieldworkField(PropertyGroup):
     )  # fmt: skip
     crop: PointerProperty(
         name="Crop Box", description="Empty whose cube cuts the field; none: all of it is shown",
-        type=bpy.types.Object, poll=_is_crop_box, **SHOWN,
+        type=bpy.types.Object, poll=_is_crop_box, update=_counts_otherwise, override=OVERRIDABLE,
     )  # fmt: skip
     classes: CollectionProperty(type=FieldworkFieldClass, override=OVERRIDABLE)
     class_index: IntProperty(name="Class", description="Selected class")

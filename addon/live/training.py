@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import bpy
 from mathutils import Matrix
 
-from . import fields
+from . import fields, index
 from .redraw import redraw_views
 
 HEADER = 64  # as nerfcore/film/shared_file.py writes it
@@ -230,7 +230,8 @@ def _is_there(key: tuple[int, str]) -> bool:
             if area.type == "VIEW_3D" and any(region.as_pointer() == key[0] for region in area.regions):
                 layer = window.view_layer
                 name = key[1].partition("\n")[0]  # of a part: that of the scene's object
-                obj = next((obj for obj in layer.objects if obj.name_full == name), None)  # also linked ones
+                found = index.current().objects
+                obj = next((obj for obj in found if obj.name_full == name), None)  # also linked ones
                 return obj is not None and obj.visible_get(view_layer=layer)
     return False
 

@@ -7,12 +7,15 @@ import bpy
 from bpy.types import Context, Operator
 
 from ..addon.jobs.job import Done, Job
+from ..addon.jobs.queue import queue
 from ..addon.project import snapshot, things
 from ..addon.props import BoolProperty, IntProperty, StringProperty
 from ..addon.text import t
 from ..addon.undo import undo_step
 from .base import ProjectOperator, refresh_scenes, scene_settings
 from .measure import need_mesh
+
+NOTHING = "Select a thing first, in the list or in the viewport."
 
 
 @scene_settings(run="run", query="thing_query")
@@ -78,6 +81,11 @@ class FIELDWORK_OT_instances(ProjectOperator):
     def invoke(self, context: Context, event: bpy.types.Event) -> set[str]:
         if self.rename or self.merge or self.split:
             return self.execute(context)
+        names = selected_names(context)
+        if not names and not self.things:
+            self.report({"ERROR"}, t(NOTHING))
+            return {"CANCELLED"}
+        self.rename = self.things or names[0]
         return context.window_manager.invoke_props_dialog(self)
 
     def parameters(self, context: Context) -> dict[str, Any]:
@@ -87,8 +95,10 @@ class FIELDWORK_OT_instances(ProjectOperator):
         if not (self.rename or self.merge or self.split):
             return params
         if not names:
-            raise ValueError(t("Select the object of a thing first."))
+            raise ValueError(t(NOTHING))
         if self.merge:
+            if len(names) < 2:
+                raise ValueError(t("Select two things or more to join: in the list with Ctrl."))
             return {**params, "merge": names}
         return {**params, "split": names[0]} if self.split else {**params, "rename": [names[0], self.rename]}
 
@@ -97,17 +107,15 @@ class FIELDWORK_OT_instances(ProjectOperator):
 
 
 def selected_names(context: Context) -> list[str]:
-    """The names of the things whose objects are selected, the active one first."""
+    """The names of the things that are selected, the active one first."""
     from ..addon.scene import things as objects  # not at the top: enabling the extension must be quick
 
     settings = context.scene.fieldwork
     folder = snapshot.folder_of(settings)
     known = snapshot.cached_json(folder / "exports" / settings.run / "instances.json") if folder else None
     names = {entry["id"]: entry["name"] for entry in known or []}
-    own = objects.objects(snapshot.owner(folder)) if folder else {}
-    chosen = [number for number, item in own.items() if item.select_get() and number in names]
-    active = context.view_layer.objects.active
-    return [names[number] for number in sorted(chosen, key=lambda number: own[number] != active)]
+    chosen = objects.selected(snapshot.owner(folder)) if folder else []
+    return [names[number] for number in chosen if number in names]
 
 
 def show_instances(job: Job) -> None:
@@ -125,6 +133,9 @@ def show_instances(job: Job) -> None:
             call(own[entry["id"]], entry["name"])
     if job.params.get("rename"):
         rename_in_fields(job.project, str(job.params.get("run", "main")), *job.params["rename"])
+    if not bpy.app.background and job.result["changed"]:  # the list is that of the relations, which name the things
+        params = {"project": str(job.project), "run": str(job.params.get("run", "main"))}
+        queue.follow_up(queue.make("relations", params, show_relations))
     if own and (job.params.get("merge") or job.params.get("split")):
         job.warnings.append(t("Press Update Scene to see the things as they are now."))
     undo_step("Change Things")
@@ -141,7 +152,7 @@ def rename_in_fields(project: Path, run: str, old: str, new: str) -> None:
 
 
 class FIELDWORK_OT_select_thing(Operator):
-    """Select the object of the thing, and what is on it with Shift; where the surface is one object, its faces"""
+    """Select the object of the thing; where the surface is one object, its faces. Shift: also what it holds. Ctrl: beside what is selected"""
 
     bl_idname = "fieldwork.select_thing"
     bl_label = "Select Thing"
@@ -149,6 +160,7 @@ class FIELDWORK_OT_select_thing(Operator):
 
     number: IntProperty(name="Number", description="Number of the thing", options={"SKIP_SAVE"})
     below: BoolProperty(name="All of It", description="Also what it holds", options={"SKIP_SAVE"})
+    extend: BoolProperty(name="Extend", description="What is selected stays selected", options={"SKIP_SAVE"})
 
     @classmethod
     def poll(cls, context: Context) -> bool:
@@ -158,7 +170,7 @@ class FIELDWORK_OT_select_thing(Operator):
         return True
 
     def invoke(self, context: Context, event: bpy.types.Event) -> set[str]:
-        self.below = self.below or event.shift
+        self.below, self.extend = self.below or event.shift, self.extend or event.ctrl
         return self.execute(context)
 
     def execute(self, context: Context) -> set[str]:
@@ -170,7 +182,7 @@ class FIELDWORK_OT_select_thing(Operator):
         chosen = [self.number]
         if self.below and known is not None:
             chosen += things.held(things.outline(known), self.number)
-        if folder is None or not objects.select(snapshot.owner(folder), chosen):
+        if folder is None or not objects.select(snapshot.owner(folder), chosen, self.extend):
             self.report({"WARNING"}, t("It is not in the scene: press Update Scene."))
             return {"CANCELLED"}
         return {"FINISHED"}

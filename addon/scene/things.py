@@ -27,12 +27,12 @@ def describe(owner: Owner, graph: Mapping[str, Any]) -> None:
         relate(item, names, graph["relations"])
 
 
-def select(owner: Owner, numbers: Iterable[int]) -> int:
-    """Select these instances alone: their objects, or their faces where the surface is one object. Returns how many were
-    found."""
+def select(owner: Owner, numbers: Iterable[int], extend: bool = False) -> int:
+    """Select these instances, alone or beside what is selected: their objects, or their faces where the surface is one object.
+    Returns how many were found."""
     wanted, layer = list(numbers), bpy.context.view_layer
     layer.update()  # it does not list what was linked just now
-    for item in layer.objects:
+    for item in layer.objects if not extend else ():
         item.select_set(False)
     found, own = 0, objects(owner)
     for number in wanted:
@@ -42,10 +42,30 @@ def select(owner: Owner, numbers: Iterable[int]) -> int:
             item.select_set(True)
             layer.objects.active = item
             found += 1
-    return found or _select_faces(owner, wanted)
+    return found or _select_faces(owner, wanted, extend)
 
 
-def _select_faces(owner: Owner, numbers: list[int]) -> int:
+def selected(owner: Owner) -> list[int]:
+    """The instances whose objects are selected, the active one first; where the surface is one object, those whose faces are."""
+    own, active = objects(owner), bpy.context.view_layer.objects.active
+    chosen = [number for number, item in own.items() if item.select_get()]
+    if own or active is None or active.type != "MESH" or not owner.owns(active) or not active.select_get():
+        return sorted(chosen, key=lambda number: own[number] != active)
+    attribute = active.data.attributes.get(INSTANCE_ATTRIBUTE)
+    if attribute is None or active.mode != "OBJECT":
+        return []
+    instance = np.empty(len(active.data.polygons), np.int32)
+    attribute.data.foreach_get("value", instance)
+    return np.unique(instance[_chosen_faces(active)]).tolist()
+
+
+def _chosen_faces(item: bpy.types.Object) -> np.ndarray:
+    chosen = np.empty(len(item.data.polygons), bool)
+    item.data.polygons.foreach_get("select", chosen)
+    return chosen
+
+
+def _select_faces(owner: Owner, numbers: list[int], extend: bool) -> int:
     layer, found = bpy.context.view_layer, 0
     for item in meshes(owner):
         attribute = item.data.attributes.get(INSTANCE_ATTRIBUTE)
@@ -53,7 +73,9 @@ def _select_faces(owner: Owner, numbers: list[int]) -> int:
             continue
         instance = np.empty(len(item.data.polygons), np.int32)
         attribute.data.foreach_get("value", instance)
-        chosen = np.isin(instance, numbers)
+        wanted = chosen = np.isin(instance, numbers)
+        if extend:
+            chosen = wanted | _chosen_faces(item)
         edges = np.zeros(len(item.data.edges), bool)
         vertices = np.zeros(len(item.data.vertices), bool)
         corner_edge, corner_vertex = (np.empty(len(item.data.loops), np.int32) for _ in range(2))
@@ -69,5 +91,5 @@ def _select_faces(owner: Owner, numbers: list[int]) -> int:
         item.data.update()
         item.select_set(True)
         layer.objects.active = item
-        found += len(set(instance[chosen].tolist()))
+        found += len(set(instance[wanted].tolist()))
     return found

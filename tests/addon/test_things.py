@@ -138,8 +138,11 @@ bpy.ops.fieldwork.instances(rename="Ming")
 things.select(owner, [3, 4])
 bpy.context.view_layer.objects.active = bpy.data.objects["Ming"]
 bpy.ops.fieldwork.instances(merge=True)
+one = attempt(lambda: (things.select(owner, [3]), bpy.ops.fieldwork.instances(merge=True))[1])
+bpy.ops.fieldwork.select_thing(number=4, extend=True)
+extended = chosen()
 nothing = attempt(lambda: (things.select(owner, []), bpy.ops.fieldwork.instances(split=True))[1])
-answer({"seen": seen, "gone": gone, "picked": picked, "asked": asked, "named": sorted(i.name for i in scene.objects), "nothing": nothing})
+answer({"seen": seen, "gone": gone, "picked": picked, "asked": asked, "named": sorted(i.name for i in scene.objects), "nothing": nothing, "one": one, "extended": extended})
 """,
         folder=project,
         names={str(number): name for number, name in NAMES.items()},
@@ -155,7 +158,9 @@ answer({"seen": seen, "gone": gone, "picked": picked, "asked": asked, "named": s
     assert facts["asked"][2]["merge"] == ["vase.001", "lamp.001"]
     assert "Ming" in facts["named"]
     assert "vase.001" not in facts["named"]
-    assert "Select the object" in facts["nothing"]
+    assert "Select a thing" in facts["nothing"]
+    assert "two things" in facts["one"]
+    assert facts["extended"] == ["Ming", "lamp.001"]
     # As the package brings them into the scene.
     value["instances"] = [{"id": 1, "name": "gold.001", "class_id": 2}, {"id": 2, "name": "base", "class_id": 1}]
     value["relations"] = [{"subject": 1, "relation": "on", "object": 2, "gap": 0.0}]
@@ -180,7 +185,14 @@ chosen = np.empty(len(mesh.polygons), bool)
 mesh.polygons.foreach_get("select", chosen)
 own = np.empty(len(mesh.polygons), np.int32)
 mesh.attributes["instance_id"].data.foreach_get("value", own)
-answer({"told": told, "count": count, "same": bool(((own == 1) == chosen).all()), "some": int(chosen.sum())})
+selected = [things.selected(owner)]
+other = int(own[own != 1][0])
+things.select(owner, [other], extend=True)
+selected.append(sorted(things.selected(owner)) == sorted([1, other]))
+things.select(owner, [other])
+selected.append(things.selected(owner) == [other])
+same, some = bool(((own == 1) == chosen).all()), int(chosen.sum())
+answer({"told": told, "count": count, "same": same, "some": some, "selected": selected})
 """,
         package=package,
     )
@@ -188,6 +200,31 @@ answer({"told": told, "count": count, "same": bool(((own == 1) == chosen).all())
     assert facts["count"] == 1
     assert facts["same"]
     assert facts["some"] > 0
+    assert facts["selected"] == [[1], True, True], "things of a surface in one piece can be renamed and joined, too"
+
+
+def test_things_that_were_changed_in_a_window_are_listed_again(bpy_script, tmp_path):
+    """With their relations, by whose names the list goes."""
+    folder = with_graph(make_posed_project(tmp_path / "capture"))
+    asked = bpy_script(
+        SETUP
+        + """
+from types import SimpleNamespace
+from fieldwork.addon.jobs.job import Job
+from fieldwork.operators import things
+asked = []
+things.bpy = SimpleNamespace(app=SimpleNamespace(background=False), data=bpy.data)
+things.queue = SimpleNamespace(make=lambda verb, params, done: [verb, params, done.__name__], follow_up=asked.append)
+things.undo_step = lambda name: None
+for changed in (["Ming"], []):
+    result = {"instances": [{"id": 3, "name": "Ming"}], "changed": changed}
+    params = {"project": folder, "run": "main"}
+    things.show_instances(Job("instances", params, "x", Path(folder), state="done", result=result))
+answer(asked)
+""",
+        folder=folder,
+    )
+    assert asked == [["relations", {"project": str(folder), "run": "main"}, "show_relations"]]
 
 
 def test_a_renamed_thing_keeps_its_look_and_copies_in_fields(bpy_script, tmp_path):

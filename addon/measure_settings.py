@@ -18,6 +18,7 @@ class MeasureSettings:
         default=0.0,
         min=0.0,
         soft_max=5.0,
+        subtype="PERCENTAGE",
     )
     caps: FloatProperty(
         name="Caps",

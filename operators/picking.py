@@ -100,7 +100,10 @@ class FIELDWORK_OT_pick_surface(ViewportPick):
 
     @classmethod
     def poll(cls, context: Context) -> bool:
-        return context.area is not None and context.area.type == "VIEW_3D"
+        if context.area is None or context.area.type != "VIEW_3D":
+            cls.poll_message_set(t("Places are picked in a 3D viewport"))
+            return False
+        return True
 
     def invoke(self, context: Context, event: Event) -> set[str]:
         return self.wait(context)

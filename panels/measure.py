@@ -52,9 +52,9 @@ class FIELDWORK_PT_measure(StepPanel):
 
 
 def draw_measures(layout: UILayout, measures: dict[str, Any]) -> None:
-    """Area and volume of the whole surface and of each class with half their intervals."""
+    """Area and volume of the whole surface and of each class, and distances, with half their intervals."""
     box = layout.box().column(align=True)
-    for name, amounts in measured_rows(measures):
+    for name, amounts in (*measured_rows(measures), *distance_rows(measures)):
         line = box.split(factor=0.3)
         line.label(text=name, translate=False)
         line.label(text=amounts, translate=False)
@@ -71,6 +71,19 @@ def measured_rows(measures: dict[str, Any]) -> list[tuple[str, str]]:
         (name, "   ".join(filter(None, [*(amount_text(row, *unit) for unit in units), guess_text(row)])))
         for name, row in rows
     ]
+
+
+def distance_rows(measures: dict[str, Any]) -> list[tuple[str, str]]:
+    """The names of distances, how long they are, and by how much they differ from what is known of them."""
+    from ..nerfcore.measure.wording import amount  # not at the top: enabling the extension must be quick
+
+    unit, rows = " m" if measures.get("unit") == "m" else "", []
+    for row in measures.get("distances", [])[:MOST_ROWS]:
+        words = [amount(row["length"], row["high"] - row["length"]) + unit]
+        if row.get("difference") is not None:
+            words.append(t("{:+.3g} m off", row["difference"]))
+        rows.append((row["name"], "   ".join(words)))
+    return rows
 
 
 def guess_text(row: dict[str, Any]) -> str:

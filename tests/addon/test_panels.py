@@ -308,6 +308,19 @@ def test_the_whole_surface_is_said_before_the_classes():
     assert measured_rows(measures) == [("Gold", "1.238 ± 0.030")]
 
 
+def test_distances_are_told_beside_what_is_known_of_them():
+    from fieldwork.panels.measure import distance_rows
+
+    told = {"name": "door", "length": 2.0121, "low": 2.0021, "high": 2.0221, "known": 2.0, "difference": 0.0121}
+    free = {**told, "name": "sill", "known": None, "difference": None}
+    assert distance_rows({"unit": "m", "distances": [told, free]}) == [
+        ("door", "2.012 ± 0.010 m   +0.0121 m off"),
+        ("sill", "2.012 ± 0.010 m"),
+    ]
+    assert distance_rows({"unit": "scene units", "distances": [free]}) == [("sill", "2.012 ± 0.010")]
+    assert distance_rows({"unit": "m"}) == []
+
+
 def test_headers_say_the_state_of_each_step(bpy_script, tmp_path):
     facts = bpy_script(
         """

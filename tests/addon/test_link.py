@@ -41,8 +41,8 @@ def wait_for(link: Link, condition, timeout: float = 20.0) -> None:
 
 
 def test_link_needs_only_the_standard_library():
-    own = {"link", "place", "errors"}
-    for name in ("link.py", "place.py", "../errors.py"):
+    own = {"link", "in_use", "place", "errors"}
+    for name in ("link.py", "in_use.py", "place.py", "../errors.py"):
         tree = ast.parse((Path(module.__file__).parent / name).read_text())
         imports = [node for node in ast.walk(tree) if isinstance(node, (ast.Import, ast.ImportFrom))]
         relative = {node.module for node in imports if isinstance(node, ast.ImportFrom) and node.level}

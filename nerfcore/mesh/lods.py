@@ -19,6 +19,7 @@ from .decimate import decimate_patches
 from .metrics import sample_surface
 from .parts import Texture, texture_of
 from .photo_texture import field_texture
+from .stored import level_names
 from .surface import Surface, vertex_normals
 from .uv import unwrap
 
@@ -73,11 +74,12 @@ def write_level(folder: Path, number: int, level: Level, check: Callable[[], Non
     arrays: dict[str, Any] = {name: value for name, value in vars(level.surface).items() if value is not None}
     if level.uv is not None:
         arrays["uv"] = level.uv
-    written = [folder / f"mesh_lod{number}.npz"]
+    mesh, texture = level_names(number)
+    written = [folder / mesh]
     with atomic_path(written[0]) as temporary, open(temporary, "wb") as file:
         np.savez(file, **arrays)
     if level.texture is not None:
-        written.append(folder / f"texture_lod{number}.png")
+        written.append(folder / texture)
         with atomic_path(written[1]) as temporary:
             write_picture(temporary, level.texture.image, check)
     return written

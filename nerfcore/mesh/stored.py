@@ -32,18 +32,24 @@ def mesh_folder(project: Path, run: str) -> Path:
     return Path(project) / "exports" / run
 
 
-def load_surface(project: Path, run: str) -> tuple[Surface, Texture | None]:
-    """The surface of a run in the world, and its texture, as `mesh` left them.
+def level_names(level: int) -> tuple[str, str]:
+    """The names of the surface and the texture of a level of detail; 0 is the full surface."""
+    return (f"mesh_lod{level}.npz", f"texture_lod{level}.png") if level else (MESH, TEXTURE)
+
+
+def load_surface(project: Path, run: str, level: int = 0) -> tuple[Surface, Texture | None]:
+    """The surface of a run in the world, and its texture, as `mesh` left them; `level`: of detail, 0 for the full one.
 
     Raises:
         ProjectError: there is none, or its file is damaged.
     """
-    path = mesh_folder(project, run) / MESH
-    with _reading(path, f"The run “{run}” has no mesh yet.") as data:
+    name, picture_name = level_names(level)
+    path = mesh_folder(project, run) / name
+    with _reading(path, f"{path} is missing." if level else f"The run “{run}” has no mesh yet.") as data:
         stored = [field for field in fields(Surface) if field.name in data or field.default is MISSING]
         surface = Surface(**{field.name: data[field.name] for field in stored})
         uv = data.get("uv", None)
-    picture = path.with_name(TEXTURE)
+    picture = path.with_name(picture_name)
     if uv is None or not picture.is_file():
         return surface, None
     return surface, texture_of(surface.faces, uv, _picture(picture, "RGB"))

@@ -11,7 +11,7 @@ import numpy as np
 import scipy
 
 from ..errors import InputError, ProjectError
-from ..files import UNREADABLE_ARRAYS, atomic_path, write_json
+from ..files import staged, write_json
 from ..mesh.instances import Instance, joined, read_instances, write_instances
 from ..mesh.stored import MESH, mesh_folder, mesh_record
 from ..mesh.triangles import areas, components
@@ -20,6 +20,7 @@ from ..progress import Reporter
 from ..project.label_revision import LABEL_REVISION
 from ..project.runs import MEASURES, SCENE_GRAPH
 from ..project.store import load_project, record_step
+from .mesh_files import read_arrays, write_files
 
 PACKAGE = "package/package.json"  # beside the mesh, see blender/package.py
 LEAST_SHARE = 0.01  # of the area of what is split, below which a piece stays with the nearest other one
@@ -39,7 +40,7 @@ def instances(params: InstancesParams, report: Reporter) -> dict[str, Any]:
     project, target = load_project(folder), mesh_folder(folder, params.run)
     record = mesh_record(folder, params.run)
     before = read_instances(target)
-    after, changed = before, []
+    after, changed, numbers = before, [], None
     if params.rename:
         after, changed = renamed(before, *params.rename)
         for path in (target / MEASURES, target / PACKAGE):
@@ -50,14 +51,14 @@ def instances(params: InstancesParams, report: Reporter) -> dict[str, Any]:
             raise ProjectError(f"{target / MESH} has no instances.", "Run `fieldwork mesh` again.")
         report.stage("Changing instances")
         done = merged(arrays, before, params.merge) if params.merge else split(arrays, before, params.split)
-        face_instance, after, changed = done
-        for path in (target / MEASURES, target / SCENE_GRAPH):  # they are of others
-            path.unlink(missing_ok=True)
-        if params.split:  # a name without faces does no harm, faces without a name would
-            write_instances(target, after)
-        write_arrays(target / MESH, {**arrays, "face_instance": face_instance})
+        numbers, after, changed = done
     if after is not before:
-        write_instances(target, after)
+        with staged(target) as here:
+            write_instances(here, after)
+            write_files(here, folder, params.run, after, numbers, report)
+            if numbers is not None:
+                for path in (target / MEASURES, target / SCENE_GRAPH):  # they are of others
+                    path.unlink(missing_ok=True)
         record_step(folder, "instances", params.model_dump(mode="json"), {"changed": changed})
     names = {c.id: c.name for c in project.classes}
     return {
@@ -159,18 +160,3 @@ def _measured(arrays: dict[str, np.ndarray], mask: np.ndarray) -> tuple[float, t
     area = areas(vertices, faces)
     x, y, z = (np.average(vertices[faces].mean(1), axis=0, weights=np.maximum(area, 1e-30))).tolist()
     return float(area.sum()), (x, y, z)
-
-
-def read_arrays(path: Path) -> dict[str, np.ndarray]:
-    """All arrays of a stored mesh. Raises ProjectError."""
-    try:
-        with np.load(path, allow_pickle=False) as data:
-            return {name: data[name] for name in data.files}
-    except (*UNREADABLE_ARRAYS, KeyError) as error:
-        raise ProjectError(f"{path} is damaged: {error}.", "Run `fieldwork mesh` again.") from error
-
-
-def write_arrays(path: Path, arrays: dict[str, np.ndarray]) -> None:
-    """Atomically write a stored mesh. Raises DiskError."""
-    with atomic_path(path) as temporary, open(temporary, "wb") as file:
-        np.savez(file, **arrays)  # pyright: ignore[reportArgumentType]

@@ -13,6 +13,8 @@ import trimesh
 from fieldwork.nerfcore.cli import main
 from fieldwork.nerfcore.errors import InputError, ProjectError
 from fieldwork.nerfcore.files import write_json
+from fieldwork.nerfcore.mesh.features import features_of
+from fieldwork.nerfcore.mesh.files import write_surface
 from fieldwork.nerfcore.mesh.instances import (
     Instance,
     joined,
@@ -22,12 +24,14 @@ from fieldwork.nerfcore.mesh.instances import (
     with_earlier_numbers,
     write_instances,
 )
-from fieldwork.nerfcore.mesh.stored import MESH, mesh_folder
+from fieldwork.nerfcore.mesh.lods import make_levels, write_level
+from fieldwork.nerfcore.mesh.stored import MESH, load_surface, mesh_folder
 from fieldwork.nerfcore.params import InstancesParams, RelationsParams
 from fieldwork.nerfcore.progress import Reporter
-from fieldwork.nerfcore.project.runs import MEASURES, SCENE_GRAPH
+from fieldwork.nerfcore.project.fingerprints import read_made, write_made
+from fieldwork.nerfcore.project.runs import MEASURES, MESH_RECORD, SCENE_GRAPH
 from fieldwork.nerfcore.project.schema import Project, SemanticClass
-from fieldwork.nerfcore.project.store import save_project
+from fieldwork.nerfcore.project.store import load_project, save_project
 from fieldwork.nerfcore.things.edit import instances
 from fieldwork.nerfcore.things.graph import relate
 from fieldwork.nerfcore.things.query import answer
@@ -217,6 +221,44 @@ def test_instances_are_joined_and_split(project: Path) -> None:
     assert apart["book.001"] == pytest.approx(before["book.001"])
     assert apart["book.001.2"] == pytest.approx(before["book.002"])
     assert "bowl.001" in asked(project, "everything on the table")["found"]
+
+
+def test_levels_of_detail_have_the_things_as_they_are_now(project: Path, tmp_path: Path) -> None:
+    target = mesh_folder(project, "main")
+    surface, _ = load_surface(project, "main")
+    features = features_of(surface, load_project(project).classes, 0, read_instances(target))
+    files = write_surface(target / "mesh.ply", surface, features, "none")
+    for number, level in enumerate(make_levels(surface, None, 2, Reporter()), 1):
+        files += write_level(target, number, level, lambda: None)
+        features = features_of(level.surface, load_project(project).classes, 0, read_instances(target))
+        files += write_surface(target / f"mesh_lod{number}.glb", level.surface, features, "instances")
+    files += write_surface(tmp_path / "mine.glb", surface, features_of(surface, [], 0), "none")
+    made = read_made(target / MESH_RECORD)
+    assert made is not None
+    made.settings, made.result = {"split": "instances"}, {"lods": [{}, {}], "files": [str(f) for f in files]}
+    write_made(target / MESH_RECORD, made)
+
+    def extents(path: Path) -> dict[int, np.ndarray]:
+        with np.load(path) as data:
+            corners, of = data["vertices"][data["faces"]], data["face_instance"]
+            return {n: np.ptp(corners[of == n].reshape(-1, 3), axis=0) for n in np.unique(of).tolist()}
+
+    report = Reporter()
+    for values in ({"rename": ["book.001", "atlas"]}, {"merge": ["atlas", "book.002"]}, {"split": "atlas"}):
+        instances(InstancesParams(project=project, **values), report)
+        now = read_instances(target)
+        full = extents(target / MESH)
+        assert set(full) == {i.id for i in now}
+        ply = trimesh.load(target / "mesh.ply", process=False).metadata["_ply_raw"]["face"]["data"]["face_instance"]
+        assert set(ply.ravel().tolist()) == set(full)
+        for number in (1, 2):
+            level = extents(target / f"mesh_lod{number}.npz")
+            assert set(level) == set(full)
+            for n in full:
+                np.testing.assert_allclose(level[n], full[n], atol=0.1)
+            assert set(trimesh.load(target / f"mesh_lod{number}.glb").geometry) == {i.name for i in now}
+    assert len(report.warnings) == 3
+    assert all("mine.glb still has the things as they were" in warning for warning in report.warnings)
 
 
 def test_what_cannot_be_done_with_instances_is_a_sentence(project: Path, capfd: pytest.CaptureFixture[str]) -> None:

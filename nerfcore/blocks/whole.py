@@ -42,6 +42,7 @@ from ..project.label_revision import map_revision
 from ..project.runs import MEASURES, MESH_RECORD, SCENE_GRAPH, read_metrics, run_folder
 from ..project.schema import step
 from ..project.store import load_project
+from ..project.written import remove_former
 from .join import joined, open_at_seams
 from .plan import RUN, Plan, block_folder
 from .surface import load_part
@@ -80,7 +81,7 @@ def write_whole(folder: Path, plan: Plan, params: BlocksParams, report: Reporter
     numbers, instances = find_instances(
         surface.vertices, surface.faces, surface.face_class, names, scene.ignore_id, GAP * voxel
     )
-    target, out = folder / "exports" / NAME, params.out
+    target, out = folder / "exports" / NAME, params.out.absolute() if params.out else None
     earlier = earlier_instances(target, inputs, names)
     numbers, instances = with_earlier_joins(numbers, instances, earlier)
     numbers, instances = with_earlier_numbers(numbers, with_earlier_names(instances, earlier), earlier)
@@ -119,6 +120,8 @@ def write_whole(folder: Path, plan: Plan, params: BlocksParams, report: Reporter
         for name in {TEXTURE, UNSEEN} - written:
             (target / name).unlink(missing_ok=True)
     files = places.goals(files)
+    if out is not None:
+        remove_former(load_project(folder), out, files)
     result = {
         "blocks": rows,
         "vertices": len(surface.vertices),

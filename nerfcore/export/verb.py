@@ -29,6 +29,7 @@ from ..project.label_revision import map_revision
 from ..project.runs import INSTANCES, MESH_RECORD, holdout_of
 from ..project.schema import Project
 from ..project.store import load_project, record_step
+from ..project.written import remove_former
 from ..render.baked import load_baked
 from ..render.run import load_info, load_trained
 
@@ -87,8 +88,9 @@ def export(params: ExportParams, report: Reporter) -> dict[str, Any]:
     else:
         files, more = _write_field(folder, project, params, out, report)
         result |= more
+    remove_former(project, out, files)
     result["files"] = [str(path) for path in files]
-    record_step(folder, "export", params.model_dump(mode="json"), result)
+    record_step(folder, "export", {**params.model_dump(mode="json"), "out": str(out)}, result)
     return result
 
 

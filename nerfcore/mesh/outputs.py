@@ -16,6 +16,8 @@ from ..geometry.similarity import transform_points
 from ..params import MeshParams
 from ..progress import Reporter
 from ..project.runs import MEASURES, MESH_RECORD, SCENE_GRAPH
+from ..project.store import load_project
+from ..project.written import remove_former
 from .build import Built
 from .features import features_of
 from .instances import Instance, write_instances
@@ -99,7 +101,10 @@ def write_outputs(target: Path, made: Made, scene: Scene, params: MeshParams, re
             path.unlink(missing_ok=True)
         for name in {TEXTURE, *MAPS} - written:
             (target / name).unlink(missing_ok=True)
-    return places.goals(files)
+    files = places.goals(files)
+    if params.out is not None:
+        remove_former(load_project(params.project), params.out, files)
+    return files
 
 
 def _write_arrays(folder: Path, made: Made) -> list[Path]:

@@ -75,6 +75,7 @@ def mesh(params: MeshParams, report: Reporter) -> dict[str, Any]:
     if params.out is not None:
         check_format(params.out)
         require_writable(params.out)
+        params = params.model_copy(update={"out": params.out.absolute()})
     if params.turntable is not None:
         require_writable(params.turntable / "color_0.png")
     if isinstance(params.texture, int):

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
+import time
 from pathlib import Path
 
 import numpy as np
@@ -116,6 +118,27 @@ def test_a_texture_of_the_field_and_none_leave_no_maps_behind(trained: Path, tmp
     assert not list((copy / "exports/main").glob("*.png"))
     assert not list((copy / "exports/main").glob("*lod*"))
     assert "uv" not in surface(copy)
+
+
+def test_parts_and_levels_without_a_successor_go_and_files_of_the_user_stay(trained: Path, tmp_path: Path) -> None:
+    copy, folder = tmp_path / "copy", tmp_path / "out"
+    shutil.copytree(trained, copy)
+    params = {"project": copy, "resolution": 32, "out": folder / "ball.stl"}
+    run_verb("mesh", MeshParams(split="classes", lods=1, **params), Reporter())
+    assert {"ball_top.stl", "ball_lod1_top.stl"} <= {path.name for path in folder.iterdir()}
+    (folder / "ball_mine.stl").write_text("mine")
+    (folder / "ball_top.stl").write_text("edited")
+    os.utime(folder / "ball_top.stl", (time.time() + 60, time.time() + 60))
+    run_verb("mesh", MeshParams(project=copy, resolution=32), Reporter())
+    run_verb("mesh", MeshParams(**params), Reporter())
+    assert {path.name for path in folder.iterdir()} == {"ball.stl", "ball_mine.stl", "ball_top.stl"}
+    assert (folder / "ball_top.stl").read_text() == "edited"
+    # As of `export`, in the folder of the project too.
+    own = set((copy / "exports/main").iterdir())
+    export(copy, "stl", split="classes")
+    assert len(set((copy / "exports/main").iterdir()) - own) > 1
+    export(copy, "stl")
+    assert set((copy / "exports/main").iterdir()) - own == {copy / "exports/main/copy.stl"}
 
 
 def test_ply_and_stl_keep_the_world_and_the_classes(trained: Path, tmp_path: Path) -> None:

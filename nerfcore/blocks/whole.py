@@ -24,6 +24,7 @@ from ..mesh.instances import (
     with_earlier_names,
     with_earlier_numbers,
     write_instances,
+    write_kept,
 )
 from ..mesh.lods import level_files, make_levels, write_level
 from ..mesh.outputs import Places
@@ -41,7 +42,7 @@ from ..project.fingerprints import alignment, write_made
 from ..project.label_revision import map_revision
 from ..project.runs import MEASURES, MESH_RECORD, SCENE_GRAPH, read_metrics, run_folder
 from ..project.schema import step
-from ..project.store import load_project
+from ..project.store import load_project, world_from_marks
 from ..project.written import remove_former
 from .join import joined, open_at_seams
 from .plan import RUN, Plan, block_folder
@@ -67,7 +68,8 @@ def write_whole(folder: Path, plan: Plan, params: BlocksParams, report: Reporter
     from ..mesh.files import write_surface  # with its libraries, a quarter of a second
 
     report.stage("Joining the blocks")
-    inputs = {"alignment": alignment(load_project(folder))}
+    project = load_project(folder)
+    inputs = {"alignment": alignment(project)}
     parts = [load_part(folder, block) for block in plan.blocks]
     common, filled = joined(parts)
     open_edges = open_at_seams(common, parts)
@@ -82,7 +84,7 @@ def write_whole(folder: Path, plan: Plan, params: BlocksParams, report: Reporter
         surface.vertices, surface.faces, surface.face_class, names, scene.ignore_id, GAP * voxel
     )
     target, out = folder / "exports" / NAME, params.out.absolute() if params.out else None
-    earlier = earlier_instances(target, inputs, names)
+    earlier = earlier_instances(target, project, names)
     numbers, instances = with_earlier_joins(numbers, instances, earlier)
     numbers, instances = with_earlier_numbers(numbers, with_earlier_names(instances, earlier), earlier)
     surface = replace(surface, face_instance=numbers)
@@ -101,6 +103,7 @@ def write_whole(folder: Path, plan: Plan, params: BlocksParams, report: Reporter
         here = places.waiting(target)
         there = here if out is None else places.waiting(out.parent)
         files = _write_arrays(here, surface, filled, painted) + [write_instances(here, instances)]
+        write_kept(here, [], world_from_marks(project))
         files += write_surface(here / "mesh.ply", surface, features, "none", check=report.check)
         if out is not None:
             files += write_surface(there / out.name, surface, features, "none", texture, check=report.check)

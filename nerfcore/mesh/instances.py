@@ -15,7 +15,9 @@ import scipy
 
 from ..errors import ProjectError
 from ..files import write_json
+from ..geometry.similarity import similarity_scale, transform_points
 from ..project.runs import INSTANCES
+from ..project.runs import KEPT_INSTANCES as KEPT
 from .triangles import areas, border_edges, components
 
 GAP = 3.0  # voxels that a thing may be torn apart by: a crack of the reconstruction is one or two wide
@@ -78,9 +80,11 @@ def find_instances(
     return face_instance, found
 
 
-def with_earlier_names(instances: list[Instance], earlier: list[Instance]) -> list[Instance]:
+def with_earlier_names(
+    instances: list[Instance], earlier: list[Instance], reserved: Collection[str] = ()
+) -> list[Instance]:
     """The instances of a mesh that was made again, each with the name of the earlier one of its class that stood where it
-    does and was about as large; names that are new take free numbers."""
+    does and was about as large; names that are new take free numbers, none that is `reserved`."""
     pairs = []
     for number, one in enumerate(instances):
         for index, old in enumerate(earlier):
@@ -93,12 +97,12 @@ def with_earlier_names(instances: list[Instance], earlier: list[Instance]) -> li
         if number not in names and index not in used:
             names[number] = earlier[index].name
             used.add(index)
-    taken, found = set(names.values()), []
+    taken, found = {*names.values(), *reserved}, []
     for number, one in enumerate(instances):
         name = names.get(number)
         if name is None:
             stem = one.name.rpartition(".")[0]
-            free = (f"{stem}.{n:03d}" for n in range(1, len(instances) + len(earlier) + 2))
+            free = (f"{stem}.{n:03d}" for n in itertools.count(1))
             name = one.name if one.name not in taken else next(n for n in free if n not in taken)
             taken.add(name)
         found.append(replace(one, name=name))
@@ -213,6 +217,46 @@ def read_instances(folder: Path) -> list[Instance]:
         return []
     except (OSError, ValueError, TypeError, KeyError) as error:
         raise ProjectError(f"{path} is damaged: {error}.", "Run `fieldwork mesh` again.") from error
+
+
+def write_kept(folder: Path, beyond: list[Instance], world_from_marks: np.ndarray) -> Path:
+    """Write beside instances.json where the world of its places lies, (4, 4) from the frame in which marks stay, and the things
+    that are known and lie beyond the region of the mesh; its path. Raises DiskError."""
+    write_json(folder / KEPT, {"world_from_marks": world_from_marks.tolist(), "beyond": [asdict(i) for i in beyond]})
+    return folder / KEPT
+
+
+def read_known(folder: Path, world_from_marks: np.ndarray) -> list[Instance] | None:
+    """The instances beside a mesh and those that were known beyond it, in the world as it lies now; None where it is not known how
+    it lay.
+
+    Raises:
+        ProjectError: instances.json is damaged.
+    """
+    try:
+        value = json.loads((folder / KEPT).read_text(encoding="utf-8"))
+        motion = world_from_marks @ np.linalg.inv(np.array(value["world_from_marks"], np.float64).reshape(4, 4))
+        beyond = [_read(one) for one in value["beyond"]]
+    except (OSError, ValueError, TypeError, KeyError, np.linalg.LinAlgError):
+        return None
+    found = read_instances(folder)
+    names, numbers = {one.name for one in found}, {one.id for one in found}
+    free = itertools.count(1 + max([0, *numbers, *(one.id for one in beyond)]))
+    for one in beyond:
+        if one.name not in names:  # somebody gave the name to another one, or split took the number
+            found.append(replace(one, id=next(free)) if one.id in numbers else one)
+    return [_moved(one, motion) for one in found]
+
+
+def _moved(one: Instance, motion: np.ndarray) -> Instance:
+    """An instance carried by a similarity (4, 4)."""
+
+    def piece(area: float, place: tuple[float, float, float]) -> Piece:
+        x, y, z = transform_points(motion, np.array([place]))[0].tolist()
+        return area * similarity_scale(motion) ** 2, (x, y, z)
+
+    area, center = piece(one.area, one.center)
+    return replace(one, area=area, center=center, parts=tuple(piece(*part) for part in one.parts))
 
 
 def _read(value: dict[str, Any]) -> Instance:

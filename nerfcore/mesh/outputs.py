@@ -20,7 +20,7 @@ from ..project.store import load_project
 from ..project.written import remove_former
 from .build import Built
 from .features import features_of
-from .instances import Instance, write_instances
+from .instances import Instance, write_instances, write_kept
 from .lods import Level, level_files, write_level
 from .painted import MAPS, Painted, write_maps
 from .parts import Texture
@@ -32,7 +32,7 @@ from .turntable import write_pictures
 @dataclass(frozen=True)
 class Made:
     """A finished mesh in the world: `built`, in the frame of `box`, is what it was made of; pictures: by file name, of
-    the turntable; label_revision: of the marks that its classes are from, if they are from any."""
+    the turntable; beyond: instances that are known and lie outside of its region; world_from_marks: see `write_kept`; label_revision: of the marks that its classes are from, if they are from any."""
 
     surface: Surface
     texture: Texture | None
@@ -40,6 +40,8 @@ class Made:
     built: Built
     box: Box
     instances: list[Instance]
+    beyond: list[Instance]
+    world_from_marks: np.ndarray
     levels: list[Level]
     pictures: dict[str, np.ndarray]
     label_revision: int | None = None
@@ -78,6 +80,7 @@ def write_outputs(target: Path, made: Made, scene: Scene, params: MeshParams, re
         here = places.waiting(target)
         there = places.waiting(params.out.parent) if params.out is not None else here
         files = _write_arrays(here, made) + [write_instances(here, made.instances)]
+        write_kept(here, made.beyond, made.world_from_marks)
         files += write_maps(here, made.painted, {c.id: c.color for c in scene.classes}, report.check)
         surface = made.surface
         features = features_of(surface, scene.classes, scene.ignore_id, made.instances, made.label_revision)

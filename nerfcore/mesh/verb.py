@@ -18,13 +18,23 @@ from ..geometry.similarity import similarity_scale
 from ..images.picture import to_bytes
 from ..params import MeshParams
 from ..progress import Reporter
-from ..project.fingerprints import Earlier, Fingerprint, alignment, compare, digest, read_made, rounded, write_made
+from ..project.fingerprints import (
+    Earlier,
+    Fingerprint,
+    alignment,
+    compare,
+    digest,
+    moved,
+    read_made,
+    rounded,
+    write_made,
+)
 from ..project.runs import MESH_RECORD, checkpoint_id, state_id
-from ..project.schema import step
-from ..project.store import load_project, record_step
+from ..project.schema import Project, step
+from ..project.store import load_project, record_step, world_from_marks
 from ..render.run import Trained, load_info, load_trained, scene_as_trained
 from ..verdict import mesh_verdict
-from .build import Built, build, largest_share, wanted_bounds, wanted_sides
+from .build import Built, build, largest_share, wanted_bounds, wanted_region, wanted_sides
 from .coverage import coverage
 from .field_values import shade
 from .formats import check_format
@@ -33,6 +43,7 @@ from .instances import (
     Instance,
     find_instances,
     read_instances,
+    read_known,
     with_class_names,
     with_earlier_joins,
     with_earlier_names,
@@ -99,9 +110,11 @@ def mesh(params: MeshParams, report: Reporter) -> dict[str, Any]:
     face_instance, instances = find_instances(
         surface.vertices, surface.faces, surface.face_class, names, scene.ignore_id, GAP * voxel
     )
-    earlier = earlier_instances(target, inputs, names)
+    earlier = earlier_instances(target, project, names)
+    beyond = beyond_region(earlier, wanted_region(params, scene))
     face_instance, instances = with_earlier_joins(face_instance, instances, earlier)
-    face_instance, instances = with_earlier_numbers(face_instance, with_earlier_names(instances, earlier), earlier)
+    instances = with_earlier_names(instances, earlier, [one.name for one in beyond])
+    face_instance, instances = with_earlier_numbers(face_instance, instances, earlier)
     surface = replace(surface, face_instance=face_instance)
     levels = make_levels(surface, texture, params.lods, report)
     judged = judge(trained, scene, box, built, surface, photos, params, report)
@@ -111,7 +124,21 @@ def mesh(params: MeshParams, report: Reporter) -> dict[str, Any]:
         report.stage("Looking at it")
         pictures = look_around(surface, texture, colors, report, painted.maps.ids if painted.maps else None)
     revision = trained.info.label_revision
-    made = Made(surface, texture, painted, built, box, instances, levels, pictures, revision)
+    known = {one.name for one in instances}
+    beyond = [one for one in beyond if one.name not in known]
+    made = Made(
+        surface,
+        texture,
+        painted,
+        built,
+        box,
+        instances,
+        beyond,
+        world_from_marks(project),
+        levels,
+        pictures,
+        revision,
+    )
     report.stage("Writing")
     files = write_outputs(target, made, scene, params, report)
     result = {
@@ -135,17 +162,27 @@ def mesh(params: MeshParams, report: Reporter) -> dict[str, Any]:
     return result
 
 
-def earlier_instances(target: Path, inputs: dict[str, str], names: Mapping[int, str]) -> list[Instance]:
-    """The instances of the mesh that is there, where it lies as the new one will, by the present `names` of the classes; none
-    where they cannot be read."""
+def earlier_instances(target: Path, project: Project, names: Mapping[int, str]) -> list[Instance]:
+    """The instances that are known of the mesh that is there, where they lie in the world now, by the present `names` of the
+    classes; none where they cannot be read."""
     made = read_made(target / MESH_RECORD)
-    if made is None or made.inputs.get("alignment") != inputs.get("alignment"):
+    if made is None:
         return []
     try:
-        former = set(made.result.get("classes", {})) - set(names.values())
-        return with_class_names(read_instances(target), former, names)
+        known = read_known(target, world_from_marks(project))
+        if known is None:  # of an earlier version
+            known = [] if moved(made, project) else read_instances(target)
+        return with_class_names(known, set(made.result.get("classes", {})) - set(names.values()), names)
     except ProjectError:  # it is written anew
         return []
+
+
+def beyond_region(instances: list[Instance], region: tuple[np.ndarray, np.ndarray] | None) -> list[Instance]:
+    """Those whose middle lies outside of a region of the world, between two corners (3,)."""
+    if region is None:
+        return []
+    low, high = region
+    return [one for one in instances if not ((low <= one.center) & (one.center <= high)).all()]
 
 
 def judge(

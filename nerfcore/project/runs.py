@@ -24,6 +24,9 @@ METRICS = "metrics.json"
 VOXELS = "voxels"  # folder of the baked field
 MESH_RECORD = "mesh.json"  # in exports/<run>: what the mesh beside it was made from
 INSTANCES = "instances.json"  # in exports/<run>: what the numbers of instances on the mesh beside it mean
+KEPT_INSTANCES = (
+    "instances_kept.json"  # in exports/<run>: where these lie, and those known beyond the region of the mesh
+)
 SCENE_GRAPH = "scene_graph.json"  # in exports/<run>: how the instances of the mesh beside it stand to each other
 MEASURES = "measures.json"  # in exports/<run>: areas and volumes of the mesh beside it
 RENDER_RECORD = "render.json"  # in a folder of renders: what they were made from

@@ -20,8 +20,9 @@ from fieldwork.nerfcore.export.onnx_field import field_model
 from fieldwork.nerfcore.field.encoding import spherical_harmonics
 from fieldwork.nerfcore.field.hybrid import HybridField
 from fieldwork.nerfcore.geometry.contraction import grid_position
+from fieldwork.nerfcore.mesh.instances import read_instances
 from fieldwork.nerfcore.mesh.painted import MAPS
-from fieldwork.nerfcore.params import ExportParams, MeshParams, TrainParams
+from fieldwork.nerfcore.params import ExportParams, InstancesParams, MeshParams, TrainParams
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.project.store import edit_project
 from fieldwork.nerfcore.render.run import RunInfo
@@ -139,6 +140,22 @@ def test_parts_and_levels_without_a_successor_go_and_files_of_the_user_stay(trai
     assert len(set((copy / "exports/main").iterdir()) - own) > 1
     export(copy, "stl")
     assert set((copy / "exports/main").iterdir()) - own == {copy / "exports/main/copy.stl"}
+
+
+def test_things_keep_their_names_beyond_the_region_and_in_a_larger_world(trained: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "copy"
+    shutil.copytree(trained, copy)
+    before = {one.id: one.name for one in read_instances(copy / "exports/main")}
+    run_verb("instances", InstancesParams(project=copy, rename=["top.001", "lid"]), Reporter())
+    run_verb("mesh", MeshParams(project=copy, resolution=32, region="-1,-1,-1,1,1,-0.1"), Reporter())
+    assert "lid" not in [one.name for one in read_instances(copy / "exports/main")]
+    with edit_project(copy) as project:
+        project.frame.world_from_sfm = (np.diag([3.0, 3, 3, 1]) @ project.frame.world_from_sfm).tolist()
+    run_verb("mesh", MeshParams(project=copy, resolution=32), Reporter())
+    after = {one.id: one.name for one in read_instances(copy / "exports/main")}
+    lid = next(number for number, name in before.items() if name == "top.001")
+    assert after[lid] == "lid"
+    assert set(after.values()) == set(before.values()) - {"top.001"} | {"lid"}
 
 
 def test_ply_and_stl_keep_the_world_and_the_classes(trained: Path, tmp_path: Path) -> None:

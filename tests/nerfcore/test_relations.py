@@ -13,19 +13,23 @@ import trimesh
 from fieldwork.nerfcore.cli import main
 from fieldwork.nerfcore.errors import InputError, ProjectError
 from fieldwork.nerfcore.files import write_json
+from fieldwork.nerfcore.geometry.similarity import make_similarity
 from fieldwork.nerfcore.mesh.features import features_of
 from fieldwork.nerfcore.mesh.files import write_surface
 from fieldwork.nerfcore.mesh.instances import (
     Instance,
     joined,
     read_instances,
+    read_known,
     with_earlier_joins,
     with_earlier_names,
     with_earlier_numbers,
     write_instances,
+    write_kept,
 )
 from fieldwork.nerfcore.mesh.lods import make_levels, write_level
 from fieldwork.nerfcore.mesh.stored import MESH, load_surface, mesh_folder
+from fieldwork.nerfcore.mesh.verb import beyond_region
 from fieldwork.nerfcore.params import InstancesParams, RelationsParams
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.project.fingerprints import read_made, write_made
@@ -332,3 +336,36 @@ def test_a_mesh_that_is_made_again_joins_what_was_joined_by_hand(tmp_path: Path)
     assert faces.tolist() == [1, 2, 2]
     faces, found = with_earlier_joins(np.array([1, 2, 3]), after, [top, foot, other])
     assert (faces.tolist(), found) == ([1, 2, 3], after), "nobody joined these"
+
+
+def test_names_stay_beyond_the_region_and_after_the_project_was_turned_and_scaled(tmp_path: Path) -> None:
+    ming, book = Instance(2, "Ming", 4, 0.5, (0.0, 0.0, 1.0)), Instance(7, "book.001", 5, 0.3, (2.0, 0.0, 1.0))
+    earlier = [ming, replace(book, parts=((0.2, (2.0, 0.0, 1.0)),))]
+    beyond = beyond_region(earlier, (np.array([-1, -1, 0]), np.array([1, 1, 2])))
+    assert [one.name for one in beyond] == ["book.001"]
+    assert beyond_region(earlier, None) == []
+    # In the region there is a new book, which takes neither name nor number of the other one.
+    found = [Instance(1, "vase.001", 4, 0.5, (0.0, 0.0, 1.0)), Instance(2, "book.001", 5, 0.1, (0.5, 0.0, 1.0))]
+    named = with_earlier_names(found, earlier, [one.name for one in beyond])
+    assert [one.name for one in named] == ["Ming", "book.002"]
+    _, named = with_earlier_numbers(np.array([1, 2]), named, earlier)
+    assert [one.id for one in named] == [2, 8]
+    write_instances(tmp_path, named)
+    assert read_known(tmp_path, np.eye(4)) is None
+    write_kept(tmp_path, beyond, np.eye(4))
+    assert read_known(tmp_path, np.eye(4)) == [*named, *beyond]
+    # The world lies elsewhere now, is turned and twice as large.
+    motion = make_similarity(2.0, np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.array([1.0, 2, 3]))
+    known = read_known(tmp_path, motion)
+    assert known is not None
+    assert [(one.id, one.name) for one in known] == [(2, "Ming"), (8, "book.002"), (7, "book.001")]
+    np.testing.assert_allclose([one.center for one in known], [[1, 2, 5], [1, 3, 5], [1, 6, 5]])
+    np.testing.assert_allclose([one.area for one in known], [2.0, 0.4, 1.2])
+    np.testing.assert_allclose(known[2].parts[0][1], (1, 6, 5))
+    # A number or a name that another one was given meanwhile.
+    write_instances(tmp_path, [replace(named[0], id=7), named[1]])
+    assert [one.id for one in read_known(tmp_path, np.eye(4)) or []] == [7, 8, 9]
+    write_instances(tmp_path, [replace(named[0], name="book.001")])
+    assert [one.name for one in read_known(tmp_path, np.eye(4)) or []] == ["book.001"]
+    (tmp_path / "instances_kept.json").write_text('{"beyond": []}')
+    assert read_known(tmp_path, np.eye(4)) is None

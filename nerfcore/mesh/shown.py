@@ -16,6 +16,7 @@ from .facelets import small_pieces
 from .photos import Photo
 from .visibility import PosedCamera, depth_buffer
 
+CUT = 0.005
 MOST_PHOTOS, ACROSS = 16, 48  # photos that are asked, evenly spread, and rays across each
 
 
@@ -43,11 +44,23 @@ def _unknown(view: View) -> np.ndarray:
     return nearest(read_image(view.mask)[..., 0], width, height) == MASK_UNKNOWN
 
 
-def silhouette(scene: Scene, vertices: np.ndarray, faces: np.ndarray, check: Callable[[], None]) -> float | None:
+def silhouette(
+    scene: Scene,
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    check: Callable[[], None],
+    region: tuple[np.ndarray, np.ndarray] | None = None,
+) -> float | None:
     """Intersection over union of what held-out photos cut out (of all photos where none is held out) and what a mesh,
-    vertices (V, 3) and faces (F, 3) in the scene's frame, covers there; None where nothing is cut out."""
+    vertices (V, 3) and faces (F, 3) in the scene's frame, covers there; None where nothing is cut out. Of a mesh of a region
+    between two corners (3,) only where photos look into that; None where a side of it cuts the mesh, to `CUT` of its size, as
+    photos show what lies beyond."""
+    if region is not None and len(vertices):
+        room = np.minimum(vertices - region[0], region[1] - vertices).min()
+        if room < CUT * float(np.ptp(vertices, axis=0).max()):
+            return None
     views = [scene.views[i] for i in scene.test or scene.train]
-    pieces = small_pieces(vertices, faces)
+    pieces, box = small_pieces(vertices, faces), None if region is None else small_pieces(*box_surface(*region))
     both = either = 0
     for view in (views[i] for i in spread(len(views))):
         check()
@@ -57,8 +70,17 @@ def silhouette(scene: Scene, vertices: np.ndarray, faces: np.ndarray, check: Cal
         camera = PosedCamera(view.camera, np.asarray(view.camera_to_world, np.float64))
         hit = depth_buffer(camera, pieces.vertices, pieces.faces).face >= 0
         counts = ~_unknown(view)
+        if box is not None:
+            counts &= depth_buffer(camera, box.vertices, box.faces).face >= 0
         both, either = both + int((hit & shown & counts).sum()), either + int(((hit | shown) & counts).sum())
     return both / either if either else None
+
+
+def box_surface(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The box between two corners (3,): vertices (8, 3) and triangles (12, 3), outward."""
+    vertices = np.stack(np.meshgrid(*zip(low, high), indexing="ij"), -1).reshape(-1, 3)
+    sides = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    return vertices, np.array([corners for a, b, c, d in sides for corners in ((a, b, c), (a, c, d))], np.int32)
 
 
 def shown_share(

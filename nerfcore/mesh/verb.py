@@ -213,7 +213,7 @@ def judge(
         hit, found.solid, found.holes, largest, found.overlapped, found.few, asked, built.denied
     )
     result |= {"unseen": round(guessed, 4), "denied": round(built.denied, 4)}
-    outlines = silhouette(scene, surface.vertices, surface.faces, report.check)
+    outlines = silhouette(scene, surface.vertices, surface.faces, report.check, wanted_region(params, scene))
     return result if outlines is None else {**result, "silhouette": round(outlines, 4)}
 
 

@@ -80,3 +80,23 @@ def test_a_silhouette_is_not_held_against_what_nobody_knows(tmp_path: Path) -> N
     whole = silhouette(scene, ball.vertices, np.asarray(ball.faces), nothing)
     assert whole is not None
     assert whole > 0.97
+
+
+def test_of_a_region_only_what_photos_show_of_it_counts(tmp_path: Path) -> None:
+    """A ball of which the photos show a second one beside it, which is not in the region."""
+    views = ball_views(tmp_path, True)
+    for view in views:
+        assert view.mask is not None
+        mask = np.asarray(Image.open(view.mask)).copy()
+        Image.fromarray(np.maximum(mask, np.roll(mask, 60, 1))).save(view.mask)
+    scene = Scene(views, [0, 1, 2, 3], [4, 5], mask_mode="empty")
+    ball, box = trimesh.creation.icosphere(4, RADIUS), np.full(3, RADIUS * 1.05)
+    faces = np.asarray(ball.faces)
+    whole, there = (silhouette(scene, ball.vertices, faces, nothing, where) for where in (None, (-box, box)))
+    assert whole is not None
+    assert there is not None
+    assert whole < 0.6
+    assert there > 0.75  # the box around a ball shows a little of the other one
+    top = faces[ball.triangles_center[:, 2] > 0]
+    cut = trimesh.Trimesh(ball.vertices, top)  # without what no triangle has
+    assert silhouette(scene, cut.vertices, np.asarray(cut.faces), nothing, (np.array([-1.0, -1, 0]), box)) is None

@@ -6,6 +6,7 @@ Exit codes: 0 done · 1 failed · 2 wrong usage · 3 done, but with warnings or 
 
 from __future__ import annotations
 
+import csv
 import logging
 import os
 import sys
@@ -109,7 +110,10 @@ class CommaList(click.ParamType):
     name = "A,B,…"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> list[str]:
-        return value if isinstance(value, list) else [part.strip() for part in str(value).split(",")]
+        if isinstance(value, list):
+            return value
+        parts = next(csv.reader([str(value)], skipinitialspace=True), [""])  # a name with a comma in it stands in quotes
+        return [part.strip() for part in parts]
 
 
 def _box(ctx: click.Context, param: click.Parameter, value: tuple[float, ...] | None) -> list[list[float]] | None:

@@ -281,6 +281,12 @@ def test_what_cannot_be_done_with_instances_is_a_sentence(project: Path, capfd: 
     assert "vase.001" in json.loads(capfd.readouterr().out)["found"]
     assert main(["instances", str(project), "--rename", "vase.001,Ming"]) == 0
     assert "Ming" in {i.name for i in read_instances(mesh_folder(project, "main"))}
+    # Names with commas, as Blender takes them, stand in quotes.
+    assert main(["instances", str(project), "--rename", 'Ming,"vase, blue"']) == 0
+    assert main(["instances", str(project), "--rename", "vase, blue,Ming"]) == 2
+    assert "stands in quotes" in capfd.readouterr().err
+    assert main(["instances", str(project), "--rename", '"vase, blue",Ming']) == 0
+    assert "Ming" in {i.name for i in read_instances(mesh_folder(project, "main"))}
 
 
 def test_a_mesh_that_is_made_again_keeps_the_names_of_its_things() -> None:

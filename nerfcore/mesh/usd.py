@@ -5,9 +5,8 @@
 
 from __future__ import annotations
 
-import shutil
-import tempfile
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +14,7 @@ from pxr import Gf, Kind, Sdf, Tf, Usd, UsdGeom, UsdSemantics, UsdShade, UsdUtil
 
 from ..data.scene import View
 from ..errors import DiskError
-from ..files import atomic_path
+from ..files import staged
 from ..geometry.cameras import flip_camera_axes
 from ..images.picture import srgb_to_linear
 from ..project.label_revision import label_facts
@@ -53,22 +52,17 @@ def write_usd(
         DiskError: the file cannot be written.
     """
     picture = f"{path.stem}_texture.png"
-    if path.suffix.lower() == ".usdz":
-        with tempfile.TemporaryDirectory(prefix="fieldwork-usd-") as folder, atomic_path(path) as temporary:
-            inside = Path(folder) / f"{_identifier(path.stem)}.usdc"
-            _write_stage(inside, path.stem, surface, features, split, texture, png, picture, views, check)
-            _saved(lambda: UsdUtils.CreateNewUsdzPackage(Sdf.AssetPath(str(inside)), str(inside.with_suffix(".usdz"))))
-            shutil.copyfile(inside.with_suffix(".usdz"), temporary)
-        return [path]
-    with tempfile.TemporaryDirectory(prefix="fieldwork-usd-") as folder, atomic_path(path) as temporary:
-        made = Path(folder) / path.name
-        _write_stage(made, path.stem, surface, features, split, texture, png, picture, views, check)
-        shutil.copyfile(made, temporary)
-        if texture is None:
-            return [path]
-        with atomic_path(path.with_name(picture)) as beside:
-            shutil.copyfile(made.with_name(picture), beside)
-    return [path, path.with_name(picture)]
+    usdz = path.suffix.lower() == ".usdz"
+    with staged(path.parent) as here:  # where it comes to, so that no other disk may be full
+        made = here / (f"{_identifier(path.stem)}.usdc" if usdz else path.name)
+        with _saving(path):
+            _write_stage(made, path.stem, surface, features, split, texture, png, picture, views, check)
+            if usdz:
+                if not UsdUtils.CreateNewUsdzPackage(Sdf.AssetPath(str(made)), str(here / path.name)):
+                    raise _unsaved(path)
+                made.unlink()
+                made.with_name(picture).unlink(missing_ok=True)
+    return [path] if usdz or texture is None else [path, path.with_name(picture)]
 
 
 def _write_stage(
@@ -104,18 +98,21 @@ def _write_stage(
         mesh.GetPrim().SetDisplayName(label if split != "none" else "Surface")
         _label_faces(mesh, features, chosen, materials)
     _cameras(stage, root.GetPath(), views, surface.vertices)
-    _saved(stage.GetRootLayer().Save)
+    if not stage.GetRootLayer().Save():
+        raise _unsaved(file)
 
 
-def _saved(save: Callable[[], bool]) -> None:
-    """Let the library write a temporary file. Raises DiskError where it cannot, of which it does not say why in words."""
+@contextmanager
+def _saving(path: Path) -> Iterator[None]:
+    """Turn the library's failures to write a file into a `DiskError`: it does not say in words why it fails."""
     try:
-        done = save()
-    except Tf.ErrorException:
-        done = False
-    if not done:
-        folder = tempfile.gettempdir()
-        raise DiskError(f"USD cannot be written to {folder}, where it is made.", "Free some space there.")
+        yield
+    except Tf.ErrorException as error:
+        raise _unsaved(path) from error
+
+
+def _unsaved(path: Path) -> DiskError:
+    return DiskError(f"USD cannot be written to {path.parent}.", "Free some space there, or choose another folder.")
 
 
 def _mesh(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import struct
+import tempfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,6 +12,8 @@ import numpy as np
 import pytest
 import trimesh
 from fieldwork.nerfcore.data.scene import ClassInfo
+from fieldwork.nerfcore.errors import DiskError
+from fieldwork.nerfcore.mesh import usd
 from fieldwork.nerfcore.mesh.features import features_of
 from fieldwork.nerfcore.mesh.files import write_surface
 from fieldwork.nerfcore.mesh.instances import Instance
@@ -158,3 +161,22 @@ def test_areas_of_void_and_of_a_class_of_its_name_are_added() -> None:
 def test_areas_of_small_things_have_their_digits() -> None:
     small = replace(square(), vertices=square().vertices * 0.0123)
     assert class_table(small, {1: "a"})["a"] == {"faces": 1, "area": pytest.approx(0.0123**2 / 2, rel=1e-5)}
+
+
+def test_usd_is_made_where_it_comes_to_and_leaves_nothing_where_that_fails(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for kind, beside in {"usdc": ["a_texture.png"], "usdz": []}.items():
+        out = tmp_path / kind
+        written = write_surface(out / f"a.{kind}", square(), plain(), "none", texture(50))
+        assert [path.name for path in written] == [f"a.{kind}", *beside]
+        assert set(out.iterdir()) == set(written)
+        assert Usd.Stage.Open(str(written[0])) is not None
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "full"))  # a disk that has no room
+    assert len(write_surface(tmp_path / "plain.usdz", square(), plain(), "none")) == 1
+    monkeypatch.setattr(usd.UsdUtils, "CreateNewUsdzPackage", lambda *_: False)
+    (tmp_path / "b").mkdir()
+    (tmp_path / "b/a.usdz").write_bytes(b"earlier")
+    with pytest.raises(DiskError, match=r"USD cannot be written to .*/b\."):
+        write_surface(tmp_path / "b/a.usdz", square(), plain(), "none")
+    assert [path.read_bytes() for path in (tmp_path / "b").iterdir()] == [b"earlier"]

@@ -324,6 +324,10 @@ def _warn(records: list[ImageRecord], rejected: list[dict[str, str]], report: Re
     for record in used:
         if record.reason:
             report.warn(f"{record.name}: {record.reason}")
+    wide = [r.name for r in used if r.focal_px is None and r.width == 2 * r.height]
+    if wide:
+        told = shortened("Photos are exactly twice as wide as high and say nothing of their lens", wide)
+        report.warn(f"{told} If they are panoramas, leave them out: poses need single photos.")
     if rejected:
         reasons = [f"{item['file']} ({item['reason']})" for item in rejected]
         report.warn(shortened(f"{len(rejected)} of {len(used) + len(rejected)} files were left out", reasons))

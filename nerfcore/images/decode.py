@@ -128,8 +128,6 @@ def _read_pillow(path: Path, max_size: int, turn: bool) -> Photo:
         orientation = tag if turn else 1
         stored_size = _stored_size(image, tag)
         facts = photo_facts(exif, stored_size)
-        if "GPano:ProjectionType" in str(image.info.get("xmp", b"")[:20000]):
-            facts["panorama"] = True
         if max_size and image.format == "JPEG":
             # The decoder itself halves the size as often as it can without falling below the working size.
             scale = max_size / max(stored_size)
@@ -145,6 +143,8 @@ def _read_pillow(path: Path, max_size: int, turn: bool) -> Photo:
         else:
             image.load()
             decoded = stored_pixels(_to_srgb(image), image.format, tag)
+        if b"GPano:ProjectionType" in image.info.get("xmp", b""):  # which may stand behind the pixels of a PNG
+            facts["panorama"] = True
     full = (stored_size[1], stored_size[0]) if orientation >= 5 else stored_size
     return Photo(_upright_picture(decoded, orientation), full, orientation, lossy, facts)
 

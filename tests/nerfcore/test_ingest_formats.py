@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import io
 import struct
+import zlib
 from pathlib import Path
 
 import numpy as np
 import OpenImageIO as oiio
 import pytest
+from fieldwork.nerfcore.capture import ingest
 from fieldwork.nerfcore.errors import InputError
 from fieldwork.nerfcore.images.decode import read_photo
 from fieldwork.nerfcore.images.picture import Picture, to_srgb8
+from fieldwork.nerfcore.params import NewParams
+from fieldwork.nerfcore.progress import Reporter
 from fieldwork.tests.nerfcore.support.photos import close, exif, new, picture
 from PIL import ExifTags, Image
 
@@ -206,3 +210,20 @@ def test_truncation_is_found_in_every_format(tmp_path: Path) -> None:
         (tmp_path / f"a.{suffix}").write_bytes(buffer.getvalue()[: len(buffer.getvalue()) * 2 // 3])
         with pytest.raises(InputError):
             read_photo(tmp_path / f"a.{suffix}")
+
+
+def test_panoramas_are_told_by_what_a_png_says_behind_its_pixels_and_by_their_shape(tmp_path: Path) -> None:
+    photos, report = tmp_path / "photos", Reporter()
+    photos.mkdir()
+    rng = np.random.default_rng(0)
+    for name, size in {"a": (400, 300), "b": (400, 200), "c": (400, 300), "d": (400, 300), "e": (400, 300)}.items():
+        Image.fromarray(rng.integers(0, 255, (size[1], size[0], 3), np.uint8)).save(photos / f"{name}.png")
+    said = b"XML:com.adobe.xmp\0\0\0\0\0<rdf:Description GPano:ProjectionType='equirectangular'/>"
+    chunk = struct.pack(">I", len(said)) + b"iTXt" + said + struct.pack(">I", zlib.crc32(b"iTXt" + said))
+    data = (photos / "a.png").read_bytes()
+    (photos / "a.png").write_bytes(data[:-12] + chunk + data[-12:])  # before the end, as exiftool puts it
+    result = ingest.new(NewParams(project=tmp_path / "p", photos=photos), report)
+    assert [(row["file"], "a panorama" in row["reason"]) for row in result["rejected"]] == [("a.png", True)]
+    assert result["images"] == 4
+    (told,) = [warning for warning in report.warnings if "twice as wide" in warning]
+    assert ": b. If they are panoramas, leave them out" in told

@@ -61,7 +61,7 @@ def image_size(path: Path) -> tuple[int, int]:
     Raises:
         InputError: the file is not a readable image.
     """
-    if path.suffix.lower() in FLOAT_SUFFIXES or is_linear(path):
+    if path.suffix.lower() in FLOAT_SUFFIXES or is_linear(path) or _unknown_tiff(path):
         source = oiio.ImageInput.open(str(path))
         if source is None:
             raise InputError(f"{path} is not a readable image: {oiio.geterror()}.", "Replace or remove it.")
@@ -97,6 +97,8 @@ def read_photo(path: Path, max_size: int = 0, exposure: float = 1.0, turn: bool 
             return _fit(_read_float(path, exposure, turn), max_size)
         if suffix in RAW_SUFFIXES and suffix != ".raw":
             return _fit(_read_raw(path, turn), max_size)
+        if _unknown_tiff(path):
+            return _fit(_read_float(path, 1.0, turn), max_size)
         return _fit(_read_pillow(path, max_size, turn), max_size)
     except PermissionError as error:
         raise InputError("the file cannot be read: permission denied") from error
@@ -256,6 +258,17 @@ def _read_oiio(path: Path) -> tuple[Picture, Any]:
     alpha = [names.index("A")] if "A" in names and names.index("A") not in color else []
     kept = "straight" if spec.getattribute("oiio:UnassociatedAlpha") else "associated"
     return from_channels(pixels[..., color + alpha], "linear" if is_float else "srgb", kept), spec
+
+
+def _unknown_tiff(path: Path) -> bool:
+    """Whether a file is a TIFF of a kind that Pillow does not know and OpenImageIO does, such as grey of 16 bits with alpha."""
+    if path.suffix.lower() not in TIFF_SUFFIXES:
+        return False
+    try:
+        with Image.open(path):
+            return False
+    except UNDECODABLE:
+        return oiio.ImageInput.open(str(path)) is not None
 
 
 def _read_float(path: Path, exposure: float, turn: bool) -> Photo:

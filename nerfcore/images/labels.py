@@ -73,7 +73,13 @@ def _is_lossy_webp(path: Path) -> bool:
 
 
 def _from_palette(image: Image.Image, colors: Colors | None, ignore_id: int) -> np.ndarray:
-    indices = np.asarray(image).astype(np.int64)
+    indices, alpha = np.asarray(image).astype(np.int64), np.full(256, 255)
+    clear = image.info.get("transparency", b"")  # an index, or the alpha of the first ones
+    alpha[clear if isinstance(clear, int) else slice(len(clear))] = 0 if isinstance(clear, int) else list(clear)
+    return np.where(alpha[indices] > 127, _palette_ids(image, indices, colors, ignore_id), ignore_id)
+
+
+def _palette_ids(image: Image.Image, indices: np.ndarray, colors: Colors | None, ignore_id: int) -> np.ndarray:
     palette = np.array(image.getpalette("RGB"), np.uint8).reshape(-1, 3)
     if not colors:
         return indices

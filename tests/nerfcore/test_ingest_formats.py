@@ -12,7 +12,7 @@ import OpenImageIO as oiio
 import pytest
 from fieldwork.nerfcore.capture import ingest
 from fieldwork.nerfcore.errors import InputError
-from fieldwork.nerfcore.images.decode import read_photo
+from fieldwork.nerfcore.images.decode import image_size, read_photo
 from fieldwork.nerfcore.images.picture import Picture, to_srgb8
 from fieldwork.nerfcore.params import NewParams
 from fieldwork.nerfcore.progress import Reporter
@@ -227,3 +227,21 @@ def test_panoramas_are_told_by_what_a_png_says_behind_its_pixels_and_by_their_sh
     assert result["images"] == 4
     (told,) = [warning for warning in report.warnings if "twice as wide" in warning]
     assert ": b. If they are panoramas, leave them out" in told
+
+
+@pytest.mark.parametrize(("kind", "channels"), [("uint16", 2), ("uint16", 5), ("uint8", 5)])
+def test_tiffs_with_alpha_and_more_channels(tmp_path: Path, kind: str, channels: int) -> None:
+    """Grey of 16 bits with alpha, and colours beside which infrared lies."""
+    values = np.random.default_rng(0).integers(0, 255, (70, 90, channels)).astype(kind)
+    spec = oiio.ImageSpec(90, 70, channels, kind)
+    spec.channelnames = ("Y", "A") if channels == 2 else ("R", "G", "B", "A", "NIR")
+    spec.alpha_channel = 1 if channels == 2 else 3
+    spec.attribute("oiio:UnassociatedAlpha", 1)
+    out = oiio.ImageOutput.create(str(tmp_path / "a.tif"))
+    assert out.open(str(tmp_path / "a.tif"), spec)
+    assert out.write_image(values * (257 if kind == "uint16" else 1))
+    assert out.close()
+    photo = read_photo(tmp_path / "a.tif")
+    wanted = values[..., [0, 0, 0, 1] if channels == 2 else [0, 1, 2, 3]]
+    assert (photo.picture.pixels == wanted).all()
+    assert image_size(tmp_path / "a.tif") == photo.full_size == (90, 70)

@@ -248,3 +248,12 @@ def test_labels_that_came_later_stay_when_it_runs_again(tmp_path: Path) -> None:
     ingest.new(NewParams(photos=photos, project=project, max_size=200), again)
     assert not any(record.label for record in load_project(project).images)
     assert any("do not fit their new size" in text and "p1" in text for text in again.warnings)
+
+
+@pytest.mark.parametrize("clear", [1, bytes([255, 20])])
+def test_transparent_colours_of_a_palette_are_void(tmp_path: Path, clear: int | bytes) -> None:
+    image = Image.fromarray(np.array([[0, 1, 2]], np.uint8))
+    image.putpalette([255, 0, 0, 9, 9, 9, 0, 255, 0])
+    image.save(tmp_path / "a.png", transparency=clear)
+    assert read_labels(tmp_path / "a.png", None, 7).tolist() == [[0, 7, 2]]
+    assert read_labels(tmp_path / "a.png", {3: (0, 255, 0), 4: (255, 0, 0), 5: (9, 9, 9)}, 7).tolist() == [[4, 7, 3]]

@@ -18,6 +18,7 @@ from ..progress import Reporter
 from ..project.store import FRAMES_FILE
 
 GREY_WIDTH = 640  # pixels, at which the sharpness of frames is compared; not tuned
+HDR = {16: "PQ", 18: "HLG"}  # transfer characteristics of ITU-T H.273
 WHOLE = 0.8  # of the time that a video says it takes, for which there must be pictures; not tuned
 
 
@@ -47,6 +48,11 @@ def extract_frames(video: Path, folder: Path, count: int, report: Reporter) -> l
             stream.thread_type = "AUTO"
             duration = _duration(container, stream) or _length(video)
             aspect = float(stream.sample_aspect_ratio or 1)
+            if hdr := HDR.get(stream.codec_context.color_trc):
+                report.warn(
+                    f"{video.name} is an HDR video ({hdr}), whose brightness is not brought to that of a screen: colours are "
+                    "flat and differ from the scene's. Record without HDR, or convert it to SDR first."
+                )
             for number, seconds, frame in _frames(container, stream):
                 if number % 10 == 0:
                     report.progress(min(seconds / duration, 1.0), f"{len(chosen)} frames chosen")

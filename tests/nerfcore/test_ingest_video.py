@@ -32,13 +32,14 @@ def frame_picture(i: int) -> Image.Image:
     return view
 
 
-def encode(path: Path, codec: str, pixels: str = "yuv420p", rotation: int = 0) -> Path:
+def encode(path: Path, codec: str, pixels: str = "yuv420p", rotation: int = 0, transfer: int = 2) -> Path:
     """A video of `COUNT` frames at 24 frames a second; `rotation` as a phone stores it (counter-clockwise)."""
     with av.open(str(path), "w") as container:
         stream = container.add_stream(codec, rate=24)
         turned = rotation % 180 != 0
         stream.width, stream.height = (192, 320) if turned else (320, 192)
         stream.pix_fmt = pixels
+        stream.codec_context.color_trc = transfer
         if rotation:
             stream.set_display_rotation(rotation)
         for i in range(COUNT):
@@ -207,3 +208,12 @@ def test_frames_are_known_from_whatever_folder_it_runs_again(tmp_path: Path, mon
         monkeypatch.chdir(tmp_path / folder)
         new(NewParams(project=place / "proj", photos=place / "clip.mp4", frames=4), Reporter())
         assert len(load_project(place / "proj").images) == 4
+
+
+@pytest.mark.parametrize(("transfer", "name"), [(18, "HLG"), (16, "PQ"), (1, "")])
+def test_hdr_videos_are_told(tmp_path: Path, transfer: int, name: str) -> None:
+    report = Reporter()
+    extract_frames(encode(tmp_path / "a.mp4", "libx265", "yuv420p10le", transfer=transfer), tmp_path / "f", 4, report)
+    told = [warning for warning in report.warnings if "HDR" in warning]
+    assert len(told) == bool(name)
+    assert all(f"a.mp4 is an HDR video ({name})" in warning for warning in told)

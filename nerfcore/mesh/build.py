@@ -35,7 +35,7 @@ from .fusion import TRUNCATION, Bricks, coarser, fuse_maps, tolerances
 from .gaps import close_gaps, open_places
 from .photometric import Pictures, moved_by_photos, pictures_of
 from .refine import refined_maps
-from .region import Region, choose_region, on_sides, sides_of
+from .region import Region, choose_region, drawn_in, on_sides, sides_of
 from .surface import vertex_normals
 from .triangles import area_share, areas, compact, components
 
@@ -83,9 +83,14 @@ def build(trained: Trained, project: Project, scene: Scene, params: MeshParams, 
     if params.watertight:
         vertices, faces = closed_surface(bricks, maps, tolerance, params.faces, report)
         vertices = fitted(vertices, faces, pictures, report)
+        vertices = vertices if bounds is None else drawn_in(vertices, region)[0]
     else:
         gaps = params.close_gaps / 100 * region.size
         vertices, faces, guessed = open_surface(bricks, maps, tolerance, region, params.faces, gaps, report, pictures)
+        if bounds is not None:
+            vertices, beyond = drawn_in(vertices, region)
+            there = ~beyond[faces].all(1)
+            faces, guessed = faces[there], guessed[there]
         kept, share = not_refuted(transform_points(box.world_from_box, vertices), faces, scene, report)
         vertices, faces = compact(vertices, faces[kept])
         unseen = guessed[kept] if guessed.any() else None

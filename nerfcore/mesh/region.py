@@ -54,6 +54,15 @@ def outside(sides: np.ndarray, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> n
     return np.stack([a * x + b * y + c * z + d for a, b, c, d in sides]).max(0)
 
 
+def drawn_in(vertices: np.ndarray, region: Region) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (V, 3), of which those beyond a region, by less than a voxel as a rule, are moved to the nearest place on its sides;
+    and which (V,) bool these are."""
+    inside = vertices.clip(region.low, region.high)
+    for *normal, shift in region.sides if region.sides is not None else ():
+        inside = inside - np.maximum(inside @ normal + shift, 0)[:, None] * normal
+    return inside, (inside != vertices).any(1)
+
+
 def all_hits(maps: MapArrays, most: int = 1 << 20) -> torch.Tensor:
     """Up to about `most` of the points (N, 3) that the maps show, evenly chosen."""
     step = max(1, int(((maps.depth > 0) & (maps.depth < FREE)).sum()) // most)

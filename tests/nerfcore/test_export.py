@@ -149,6 +149,7 @@ def test_things_keep_their_names_beyond_the_region_and_in_a_larger_world(trained
     run_verb("instances", InstancesParams(project=copy, rename=["top.001", "lid"]), Reporter())
     run_verb("mesh", MeshParams(project=copy, resolution=32, region="-1,-1,-1,1,1,-0.1"), Reporter())
     assert "lid" not in [one.name for one in read_instances(copy / "exports/main")]
+    assert surface(copy)["vertices"][:, 2].max() <= -0.1 + 1e-6
     with edit_project(copy) as project:
         project.frame.world_from_sfm = (np.diag([3.0, 3, 3, 1]) @ project.frame.world_from_sfm).tolist()
     run_verb("mesh", MeshParams(project=copy, resolution=32), Reporter())

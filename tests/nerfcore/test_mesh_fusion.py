@@ -27,7 +27,7 @@ from fieldwork.nerfcore.mesh.fusion import (
     spread_of,
     tolerances,
 )
-from fieldwork.nerfcore.mesh.region import Region, choose_region, on_sides, sides_of
+from fieldwork.nerfcore.mesh.region import Region, choose_region, drawn_in, on_sides, sides_of
 from fieldwork.nerfcore.mesh.surface import is_watertight
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.tests.nerfcore.support.depth_views import CAMERA, Hit, box, look_at, maps_of, orbit, sphere
@@ -359,6 +359,19 @@ def test_small_triangles_among_large_ones_are_what_is_closest() -> None:
     found = metrics.distances((vertices, small), (vertices, np.concatenate([small[:, ::-1] - 3, small])), count=200)
     assert (found.truth_face == 1).all()
     assert found.to_truth.max() < 1e-6
+
+
+def test_what_reaches_beyond_a_region_is_drawn_in() -> None:
+    low, high = np.zeros(3), np.ones(3)
+    points = np.array([[0.5, 0.5, 0.5], [1.02, 0.5, 0.5], [0.5, -0.01, 1.01]])
+    moved, beyond = drawn_in(points, Region(low, high, 0.05))
+    np.testing.assert_allclose(moved, [[0.5, 0.5, 0.5], [1, 0.5, 0.5], [0.5, 0, 1]])
+    assert beyond.tolist() == [False, True, True]
+    turn = make_similarity(2.0, Rotation.from_euler("z", 30, degrees=True).as_matrix(), low)
+    there = (points - turn[:3, 3]) @ turn[:3, :3] / 4  # in the frame where the box stands at an angle
+    moved, beyond = drawn_in(there, Region(there.min(0) - 1, there.max(0) + 1, 0.05, sides_of(low, high, turn)))
+    np.testing.assert_allclose(moved @ turn[:3, :3].T, [[0.5, 0.5, 0.5], [1, 0.5, 0.5], [0.5, 0, 1]], atol=1e-12)
+    assert beyond.tolist() == [False, True, True]
 
 
 def test_faces_on_the_sides_of_a_region_are_told() -> None:

@@ -45,6 +45,7 @@ AGREE, AGREE_PIXELS, ROUND_TRIP = (
 )  # of the depth, or footprints of a pixel where photos are small; pixels
 OUTSIDE = -1.0  # depth of pixels beside the photo, which can confirm nothing
 HIDDEN = 0.03  # share of a place's distance by which what hides it is nearer
+BORDER = 33  # places along each side of a photo by which it is told where it ends
 SMALLEST_FACE = 0.05  # share of a cube's face that a photo must show
 FLAT, ASKED = ("PINHOLE", "OPENCV"), 96  # lenses of one flat picture; longest side at which others are asked for theirs
 
@@ -120,10 +121,29 @@ def flat_views(views: list[View], box_from_world: np.ndarray, longest: int) -> l
 
 def _faces(camera: Camera, pose: np.ndarray, index: int) -> list[FlatView]:
     """Of the faces of a cube around a wide camera those that show enough of its photo, cut to what they show of it."""
-    faces = [_flat(camera, face, pose, turn, index) for face, turn in cube_faces(camera)]
+    ahead = _ahead(camera)
+    parts = cube_faces(camera) if ahead is None else [(ahead, np.eye(3))]
+    faces = [_flat(camera, face, pose, turn, index) for face, turn in parts]
     # A narrow lens fills little even of the only face that shows its photo.
     least = [min(SMALLEST_FACE * face.inside.size, SMALLEST_FACE * camera.width * camera.height) for face in faces]
     return [_cut(face) for face, fewest in zip(faces, least) if face.inside.sum() >= fewest]
+
+
+def _ahead(camera: Camera) -> Camera | None:
+    """The part of the face of the cube before a narrow camera that holds all of its photo, by what lies at the photo's border; None
+    for one that sees beyond that face. The whole face of a narrow lens has many times the pixels of its photo."""
+    width, height = camera.width, camera.height
+    along, down = (np.linspace(0, n, BORDER) for n in (width, height))
+    ends = [np.stack(np.broadcast_arrays(x, y), 1) for x, y in ((along, 0), (along, height), (0, down), (width, down))]
+    directions, valid = rays(camera, np.concatenate(ends))
+    face, _ = cube_faces(camera)[0]
+    if not valid.all() or not (np.abs(directions[:, :2]) < directions[:, 2:]).all():
+        return None
+    place = directions[:, :2] / directions[:, 2:] * face.fx + face.cx
+    low = np.maximum(np.floor(place.min(0)).astype(int) - 2, 0)
+    high = np.minimum(np.ceil(place.max(0)).astype(int) + 2, face.width)
+    size = {"width": int(high[0] - low[0]), "height": int(high[1] - low[1])}
+    return face.model_copy(update={**size, "cx": face.cx - low[0], "cy": face.cy - low[1]})
 
 
 def _cut(view: FlatView) -> FlatView:

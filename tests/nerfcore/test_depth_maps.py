@@ -337,3 +337,17 @@ def test_maps_of_wide_lenses_have_as_many_pixels_as_those_of_others(
         assert flat.inside.shape == (flat.camera.height, flat.camera.width)
         for side in (flat.inside[0], flat.inside[-1], flat.inside[:, 0], flat.inside[:, -1]):
             assert side.any(), "nothing is rendered beside the photo"
+
+
+def test_of_a_narrow_fisheye_only_the_part_of_the_cube_that_it_sees_is_made(monkeypatch: pytest.MonkeyPatch) -> None:
+    lens = {"model": "OPENCV_FISHEYE", "width": 64, "height": 48, "cx": 33.0, "cy": 23.5, "k1": 0.01}
+    narrow, wide = Camera(fx=150.0, fy=150.0, **lens), Camera(fx=30.0, fy=30.0, **lens)
+    (found,) = depth_maps._faces(narrow, np.eye(4), 0)
+    assert len(depth_maps._faces(wide, np.eye(4), 0)) > 1
+    monkeypatch.setattr(depth_maps, "_ahead", lambda camera: None)
+    (whole,) = depth_maps._faces(narrow, np.eye(4), 0)
+    assert found.camera == whole.camera
+    assert (found.inside == whole.inside).all()
+    monkeypatch.undo()
+    (far,) = depth_maps._faces(Camera(fx=40000.0, fy=40000.0, **lens), np.eye(4), 0)  # whole faces have 6 · 10⁹ pixels
+    assert far.inside.size < 1.2 * 64 * 48

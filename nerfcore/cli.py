@@ -112,7 +112,8 @@ class CommaList(click.ParamType):
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> list[str]:
         if isinstance(value, list):
             return value
-        parts = next(csv.reader([str(value)], skipinitialspace=True), [""])  # a name with a comma in it stands in quotes
+        # A name with a comma in it stands in quotes.
+        parts = next(csv.reader([str(value)], skipinitialspace=True), [""])
         return [part.strip() for part in parts]
 
 

@@ -24,7 +24,9 @@ class InstancesParams(Params):
         if bool(self.rename) + bool(self.merge) + bool(self.split) > 1:
             raise ValueError("give one of rename, merge and split")
         if self.rename and len(self.rename) != 2:
-            raise ValueError("rename takes an old and a new name: one with a comma in it stands in quotes, as in '\"a, b\",c'")
+            raise ValueError(
+                "rename takes an old and a new name: one with a comma in it stands in quotes, as in '\"a, b\",c'"
+            )
         return self
 
 

@@ -124,7 +124,7 @@ def write_whole(folder: Path, plan: Plan, params: BlocksParams, report: Reporter
             (target / name).unlink(missing_ok=True)
     files = places.goals(files)
     if out is not None:
-        remove_former(load_project(folder), out, files)
+        remove_former(load_project(folder), "blocks", out, files)
     result = {
         "blocks": rows,
         "vertices": len(surface.vertices),

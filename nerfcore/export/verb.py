@@ -88,7 +88,7 @@ def export(params: ExportParams, report: Reporter) -> dict[str, Any]:
     else:
         files, more = _write_field(folder, project, params, out, report)
         result |= more
-    remove_former(project, out, files)
+    remove_former(project, "export", out, files, params.to)
     result["files"] = [str(path) for path in files]
     record_step(folder, "export", {**params.model_dump(mode="json"), "out": str(out)}, result)
     return result

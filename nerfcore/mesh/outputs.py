@@ -106,7 +106,7 @@ def write_outputs(target: Path, made: Made, scene: Scene, params: MeshParams, re
             (target / name).unlink(missing_ok=True)
     files = places.goals(files)
     if params.out is not None:
-        remove_former(load_project(params.project), params.out, files)
+        remove_former(load_project(params.project), "mesh", params.out, files)
     return files
 
 

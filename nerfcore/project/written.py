@@ -10,10 +10,10 @@ from ..files import disk_errors
 from .schema import Project
 
 
-def remove_former(project: Project, out: Path, written: Iterable[Path]) -> None:
-    """Remove what the project's earlier steps wrote for the same `out` and the files `written` now do not replace: parts and
+def remove_former(project: Project, verb: str, out: Path, written: Iterable[Path], to: str | None = None) -> None:
+    """Remove what earlier steps of the same verb wrote for the same `out` and the files `written` now do not replace: parts and
     levels of detail of a mesh, masks of a class. What was changed since stays, it is the user's, and so does what belongs to
-    another file as well.
+    another file or format (`to` of an export: cameras and masks may share a folder) as well.
 
     Raises:
         DiskError: one cannot be removed.
@@ -21,7 +21,7 @@ def remove_former(project: Project, out: Path, written: Iterable[Path]) -> None:
     out, kept, noted = out.absolute(), {path.absolute() for path in written}, dict[Path, float]()
     for step in project.provenance:
         files = [Path(name) for name in step.result.get("files", [])]
-        if step.settings.get("out") != str(out):
+        if (step.verb, step.settings.get("out"), step.settings.get("to")) != (verb, str(out), to):
             kept.update(files)
             continue
         for path in files:

@@ -140,6 +140,11 @@ def test_parts_and_levels_without_a_successor_go_and_files_of_the_user_stay(trai
     assert len(set((copy / "exports/main").iterdir()) - own) > 1
     export(copy, "stl")
     assert set((copy / "exports/main").iterdir()) - own == {copy / "exports/main/copy.stl"}
+    # Of other formats in one folder.
+    masks = export(copy, "masks", out=tmp_path / "both")
+    export(copy, "colmap", out=tmp_path / "both")
+    assert masks
+    assert all(path.is_file() for path in masks)
 
 
 def test_things_keep_their_names_beyond_the_region_and_in_a_larger_world(trained: Path, tmp_path: Path) -> None:

@@ -64,7 +64,8 @@ class Dataset:
 
 def not_imported(count: int, source: Path) -> str:
     """What is said of so many photos that a data set names and has no pose for."""
-    return f"{count} photos have no pose in {source} and were not imported"
+    photos, were = ("photo has", "was") if count == 1 else ("photos have", "were")
+    return f"{count} {photos} no pose in {source} and {were} not imported"
 
 
 def lens_at_size(camera: Camera, size: tuple[int, int], image: Path) -> Camera:

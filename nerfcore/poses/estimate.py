@@ -107,7 +107,7 @@ def estimate_poses(params: PosesParams, report: Reporter) -> dict[str, Any]:
     if missing and len(result["groups"]) > 1:
         report.warn(in_groups(result["groups"], params.group))
     if missing:
-        where = f"{len(missing)} of {answer['total']} photos have no pose"
+        where = f"{len(missing)} of {answer['total']} photos {'has' if len(missing) == 1 else 'have'} no pose"
         report.warn(f"{shortened(where, missing)} {folder / REPORT_FILE} says why.")
     return answer
 

@@ -96,7 +96,7 @@ def test_photos_that_a_model_does_not_place_are_named(tmp_path: Path) -> None:
     (tmp_path / "cameras.txt").write_text("1 PINHOLE 40 30 40 40 20 15\n")
     (tmp_path / "images.txt").write_text("1 1 0 0 0 0 0 0 1 a.png\n\n2 1 0 0 0 0 0 1 1 b.png\n\n")
     (warning,) = read_dataset(tmp_path).warnings
-    assert "1 photos have no pose" in warning
+    assert "1 photo has no pose" in warning
     assert "c.png" in warning
 
 
@@ -289,7 +289,7 @@ def test_photos_that_metashape_did_not_place_are_named(tmp_path: Path) -> None:
     more = '<camera id="1" sensor_id="0" master_id="0" label="b"/><camera id="2" label="c" enabled="0"/></cameras>'
     (tmp_path / "cameras.xml").write_text(SENSOR.format(u=40).replace("</cameras>", more))
     (text,) = read_dataset(tmp_path).warnings
-    assert text == f"1 photos have no pose in {tmp_path / 'cameras.xml'} and were not imported: b."
+    assert text == f"1 photo has no pose in {tmp_path / 'cameras.xml'} and was not imported: b."
 
 
 def test_photos_that_meshroom_did_not_place_are_named(tmp_path: Path) -> None:

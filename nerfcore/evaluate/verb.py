@@ -272,11 +272,12 @@ def evaluate(params: EvaluateParams, report: Reporter) -> dict[str, Any]:
 
 
 def spread(count: int) -> list[int]:
-    """0 … count − 1 in an order whose first few are always spread over all of them: each halves the widest gap that the
-    ones before it leave (van der Corput's sequence)."""
-    digits = max(count - 1, 1).bit_length()
-    reverse = [int(f"{number:0{digits}b}"[::-1], 2) for number in range(1 << digits)]
-    return [place for place in reverse if place < count]
+    """0 … count − 1 in an order whose first few are always spread over all of them, from the middle on, as the first and the last
+    photo of a capture often see what few others do: each halves the widest gap that the ones before it leave (van der Corput's
+    sequence)."""
+    digits = count.bit_length() + 1
+    reverse = [int(f"{number:0{digits}b}"[::-1], 2) for number in range(1, 1 << digits)]
+    return list(dict.fromkeys(count * place >> digits for place in reverse))
 
 
 def _record(params: EvaluateParams) -> Path:

@@ -43,5 +43,5 @@ def estimate(time_limit: float) -> str:
     """How long it takes, as far as that is known before the photos are read."""
     return (
         f"Once the poses of the photos are known: {time_limit / 60:.1f} minutes of training, then about "
-        f"{seconds_after(time_limit) / 60:.1f} minutes for mesh, .blend, measurements and pictures, longer where the machine is busy."
+        f"{seconds_after(time_limit) / 60:.1f} minutes for mesh, .blend, measurements and pictures, or as long as the mesh takes."
     )

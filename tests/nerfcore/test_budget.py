@@ -58,3 +58,10 @@ def test_the_first_few_are_spread_over_all(count: int) -> None:
         places = sorted(order[:taken])
         gaps = [b - a for a, b in zip([*places], [*places[1:], count])]
         assert max(gaps) <= max(2, 4 * count / taken)
+
+
+@given(st.integers(3, 300))
+def test_the_first_ones_are_not_at_an_end(count: int) -> None:
+    order = spread(count)
+    assert order[0] == count // 2
+    assert not {0, count - 1} & set(order[: (count + 1) // 4])

@@ -16,9 +16,9 @@ LOCK_FILE = "in-use.lock"
 
 
 @contextmanager
-def used(python: Path) -> Iterator[dict[str, Any]]:
+def used(python: Path | str) -> Iterator[dict[str, Any]]:
     """Options of `Popen` with which a process that runs this Python holds its environment, where that is one of ours."""
-    environment = python.parent.parent
+    environment = Path(python).parent.parent
     ours = environment.name in ENVIRONMENTS and (environment.parent / COMPLETE).is_file()
     if sys.platform == "win32" or not ours:
         yield {}

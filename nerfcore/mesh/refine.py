@@ -33,9 +33,9 @@ from .depth_maps import (
 )
 from .plane_starts import PLANES, from_planes
 from .planes import with_planes
-from .scene_planes import ground, known_points, on_scene_planes, scene_planes
+from .scene_planes import away_from_outlines, ground, known_points, on_scene_planes, scene_planes
 from .sky import FAR, backdrop, confirmed_share, farthest, labels_tell, named_things, nothing
-from .walls import any_plain, on_walls, picture_of, plain_places, walls
+from .walls import any_plain, backdrops, on_walls, picture_of, plain_places, walls
 
 VIEWS = 5  # neighbours whose photos are compared
 LEAST, GAIN = 0.6, 0.05  # correlation that is believed, and by how much it must exceed that of the field's depth
@@ -97,7 +97,7 @@ def refined_maps(
     elsewhere (scene_planes.py); where label maps say that it is this floor, one view suffices. Where they do not confirm that either, but roughly the field's own depth, moved as the
     known ones around were (completion.py), it is taken, as far away as photos confirm depths. What label maps say is nothing,
     and backdrops without the name of a thing (sky.py), have an unknown depth. `outward`: cameras look around, so that what is plain
-    is mostly a wall (walls.py) and not the thing that they surround.
+    is mostly a wall (walls.py) and not the thing that they surround; else it is one only where label maps tell.
     """
     arrays = map_arrays(views, maps, device)
     greys = grey_pictures(views, store, report)
@@ -154,10 +154,13 @@ def refined_maps(
         on_planes, by_class = on_scene_planes(view, map_, safe, with_planes(view, map_, safe), planes, label)
         mixed.append(on_planes)
         named.append(by_class)
-    if outward:
-        pictures = [picture_of(*parts) for parts in zip(views, known, sure, plain)]
-        made = walls(known_points(views, known, sure, labels), report) if any_plain(pictures) else []
-        mixed = on_walls(pictures, around, made, mixed, labels, report)
+    told_apart = any(label is not None for label in labels)
+    pictures = [picture_of(*parts) for parts in zip(views, known, sure, plain)] if outward or told_apart else []
+    if any_plain(pictures):
+        inner = [None if label is None else np.where(away_from_outlines(label), label, VOID) for label in labels]
+        points = known_points(views, known, sure, inner)
+        made = walls(points, report)
+        mixed = on_walls(pictures, around, made if outward else backdrops(points, made), mixed, labels, report)
     final = confirmed_maps(views, mixed, device, report, around, one_suffices=named)
     carried = [moved_as_around(*parts) for parts in zip(views, fields, depths(final, maps))]
     filling = confirmed_maps(views, carried, device, report, around, agree=FIELD_AGREES, round_trip=FIELD_RETURNS)

@@ -168,7 +168,7 @@ def ground(
     own = known.at(on)
     if any(near_plane(own, plane.point, plane.normal, BESIDE).mean() > 0.5 for plane in planes):
         return None
-    return replace(found[0], partly=_partly(known, on))
+    return replace(found[0], partly=partly(known, on))
 
 
 def _largest(known: Known, area: np.ndarray, left: np.ndarray, rng: np.random.Generator) -> np.ndarray | None:
@@ -230,28 +230,34 @@ def _reaching(known: Known, on: np.ndarray, point: np.ndarray, normal: np.ndarra
     there = np.zeros(index.max(0) + rim + 1, bool)
     there[tuple(index.T)] = True
     reached = np.asarray(scipy.ndimage.distance_transform_edt(~there)) <= REACH
-    classes, partly = _flat_classes(known, point, normal), _partly(known, on)
-    return ScenePlane(point, normal, axes, low, cell, reached, np.zeros(there.shape), classes, partly)
+    flat = _flat_classes(known, point, normal)
+    return ScenePlane(point, normal, axes, low, cell, reached, np.zeros(there.shape), flat, partly(known, on))
+
+
+def bounds(known: Known, point: np.ndarray, normal: np.ndarray) -> bool:
+    """Whether nothing that is known lies behind a plane."""
+    area, off = known.footprint**2, (known.points - point) @ normal / known.error
+    return bool(area[off < -BESIDE].sum() <= BEHIND * area.sum())
 
 
 def _flat_classes(known: Known, point: np.ndarray, normal: np.ndarray) -> np.ndarray:
     """Which classes (256,) bool have nearly all of their known area within the errors of a plane behind which nothing lies."""
-    area, off = known.footprint**2, (known.points - point) @ normal / known.error
-    if area[off < -BESIDE].sum() > BEHIND * area.sum():
+    if not bounds(known, point, normal):
         return np.zeros(256, bool)
+    area, off = known.footprint**2, (known.points - point) @ normal / known.error
     own = np.bincount(known.kind, area * (off < BESIDE), 256)
     flat = own >= FLAT_CLASS * np.maximum(np.bincount(known.kind, area, 256), FEWEST * np.median(area))
     flat[VOID] = False
     return flat
 
 
-def _partly(known: Known, on: np.ndarray) -> np.ndarray:
+def partly(known: Known, on: np.ndarray) -> np.ndarray:
     """Which classes (256,) bool have a good part of their known area among the points `on` of a plane; VOID may have."""
     area = known.footprint**2
     found = np.bincount(known.kind[on], area[on], 256)
-    partly = (found > 0) & (found >= PARTLY * np.bincount(known.kind, area, 256))
-    partly[VOID] = True
-    return partly
+    some = (found > 0) & (found >= PARTLY * np.bincount(known.kind, area, 256))
+    some[VOID] = True
+    return some
 
 
 def _heights(known: Known, plane: ScenePlane) -> np.ndarray:
@@ -276,6 +282,11 @@ def _heights(known: Known, plane: ScenePlane) -> np.ndarray:
         scipy.ndimage.distance_transform_edt(~known_there, return_distances=False, return_indices=True)
     )
     return np.where(known_there, total / np.where(known_there, amount, 1), 0)[tuple(nearest)]
+
+
+def away_from_outlines(labels: np.ndarray) -> np.ndarray:
+    """Where (H, W) bool a label map (H, W) gives one class all around."""
+    return np.asarray(scipy.ndimage.maximum_filter(labels, INNER) == scipy.ndimage.minimum_filter(labels, INNER))
 
 
 def on_scene_planes(
@@ -322,5 +333,5 @@ def on_scene_planes(
     named = np.zeros(new.shape, bool)
     named[rows, columns] = by_class
     if labels is not None:
-        named &= scipy.ndimage.maximum_filter(labels, INNER) == scipy.ndimage.minimum_filter(labels, INNER)
+        named &= away_from_outlines(labels)
     return replace(map_, depth=new, spread=spread, cosine=cosines(view.camera, new)), named

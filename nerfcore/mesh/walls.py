@@ -4,7 +4,8 @@ Correlation knows no contrast: the faint shades of a white wall agree at many de
 them. All that tells where the wall is are its outlines, what hangs on it, and that walls are planes, mostly at right angles. So
 planes are put through confirmed points of places that are not plain alone, turned to common directions where their points permit
 it, and sought along these directions where only edges show a wall. A plain region of a picture lies on such a plane where the
-plane holds part of what is known around the region, and where other photos are plain where they would show the region.
+plane holds part of what is known around the region, and where other photos are plain where they would show the region. Where
+cameras surround what they look at, it does so only behind all else, and where a label map gives it the class of what is known there.
 
 Source: planes at right angles, Coughlan and Yuille, "Manhattan world", 1999.
 """
@@ -17,10 +18,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy
 
+from ..data.pixels import VOID
 from ..images.texture import left_of_slopes
 from ..progress import Reporter
 from .depth_maps import DepthMap, FlatView, cosines, pixel_directions
-from .scene_planes import FITTED_PIXELS, STEEPEST, WIDTHS, Known, near_plane, scene_planes
+from .scene_planes import BESIDE, FITTED_PIXELS, STEEPEST, WIDTHS, Known, bounds, near_plane, partly, scene_planes
 
 REACH = 4  # pixels that a window reaches from its middle, as patches that are compared do (kernels/patches.py)
 # Standard deviation of grey, less its slope, from which a window shows something: rounding makes 0.3 to 0.5.
@@ -43,10 +45,12 @@ HIDES = 0.03  # share of a depth by which what hides a place is nearer
 
 @dataclass(frozen=True)
 class Wall:
-    """A plane: a point (3,) of it and its unit normal (3,) towards the cameras."""
+    """A plane: a point (3,) of it and its unit normal (3,) towards the cameras; classes (256,) bool: which of them may lie on it,
+    None for all."""
 
     point: np.ndarray
     normal: np.ndarray
+    classes: np.ndarray | None = None
 
     def depth(self, view: FlatView, ray: np.ndarray) -> np.ndarray:
         """Depth (H, W) along the rays (H, W, 3) of a view, 0 where the wall does not face them."""
@@ -96,6 +100,18 @@ def walls(known: Known, report: Reporter) -> list[Wall]:
         if len(axes) < 3 and all(abs(wall.normal @ axis) < 1e-6 for axis in axes):
             axes.append(wall.normal)
     return made + _from_edges(known, made, axes)
+
+
+def backdrops(known: Known, made: list[Wall]) -> list[Wall]:
+    """Those of the walls behind which nothing lies, for classes only of which a good part is known to lie there: behind what
+    cameras surround, a thing that has no class may be as plain as what it stands before."""
+    found = []
+    for wall in made:
+        on = np.flatnonzero(near_plane(known, wall.point, wall.normal, BESIDE))
+        classes = partly(known, on) & (np.arange(256) != VOID)
+        if classes.any() and bounds(known, wall.point, wall.normal):
+            found.append(replace(wall, classes=classes))
+    return found
 
 
 def _turned(known: Known, wall: Wall, axes: list[np.ndarray]) -> Wall:
@@ -182,10 +198,10 @@ def _on_walls(
     others = [(pictures[other], found[other] if found else None) for other in around[:ASKED]]
     depths = [wall.depth(own.view, ray) for wall in made]
     depth, best = map_.depth.copy(), np.full(map_.depth.shape, OFF)
-    for part, region, grown in _regions(own, label):
+    for part, region, grown, kind in _regions(own, label):
         field, near = own.field.depth[part], best[part]
         ring = scipy.ndimage.binary_dilation(region, iterations=RIM) & own.sure[part]
-        for there in (all_[part] for all_ in depths):
+        for there in (all_[part] for wall, all_ in zip(made, depths) if wall.classes is None or wall.classes[kind]):
             on = ring & (np.abs(there - field) < WIDTHS[0] / own.view.camera.fx * there)
             held = on.sum() >= max(FEWEST, HELD * ring.sum())
             if not held and not found:
@@ -202,9 +218,11 @@ def _on_walls(
     return replace(map_, depth=depth, spread=spread.astype(np.float32), cosine=cosines(own.view.camera, depth))
 
 
-def _regions(own: Picture, label: np.ndarray | None) -> Iterator[tuple[tuple[slice, slice], np.ndarray, np.ndarray]]:
+def _regions(
+    own: Picture, label: np.ndarray | None
+) -> Iterator[tuple[tuple[slice, slice], np.ndarray, np.ndarray, int]]:
     """Connected plain regions of one class each: the part of the picture that holds a region and its rim, its pixels there,
-    and those together with what lies as close to them as windows reach and is not sure."""
+    those together with what lies as close to them as windows reach and is not sure, and the class, VOID without labels."""
     free = own.field.hit & ~own.sure
     for kind in [None] if label is None else np.unique(label[free & own.plain]):
         of_kind = free if kind is None else free & (label == kind)
@@ -215,7 +233,7 @@ def _regions(own: Picture, label: np.ndarray | None) -> Iterator[tuple[tuple[sli
                 rows, columns = (slice(max(0, side.start - RIM), side.stop + RIM) for side in box)
                 region = numbered[rows, columns] == index
                 grown = scipy.ndimage.binary_dilation(region, iterations=REACH) & of_kind[rows, columns]
-                yield (rows, columns), region, grown
+                yield (rows, columns), region, grown, VOID if kind is None else int(kind)
 
 
 def _asked(points: np.ndarray, others: list[tuple[Picture, DepthMap | None]]) -> tuple[float, float]:

@@ -6,11 +6,21 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from fieldwork.nerfcore.data.pixels import VOID
 from fieldwork.nerfcore.errors import Cancelled
 from fieldwork.nerfcore.geometry.cameras import Camera
 from fieldwork.nerfcore.mesh.depth_maps import DepthMap, FlatView, cosines, pixel_directions
 from fieldwork.nerfcore.mesh.scene_planes import Known, known_points
-from fieldwork.nerfcore.mesh.walls import Picture, Wall, any_plain, on_walls, picture_of, plain_places, walls
+from fieldwork.nerfcore.mesh.walls import (
+    Picture,
+    Wall,
+    any_plain,
+    backdrops,
+    on_walls,
+    picture_of,
+    plain_places,
+    walls,
+)
 from fieldwork.nerfcore.progress import Reporter
 
 LENS = Camera(width=400, height=300, fx=275.0, fy=275.0, cx=200.0, cy=150.0)
@@ -151,6 +161,61 @@ def test_a_plain_ball_stays_before_the_wall() -> None:
     assert (moved.depth == made[2].field.depth).all()
     # Without other views to ask nothing tells the ball from a part of them.
     assert (moved_of(made, found, asked=False).depth != made[2].field.depth).any()
+
+
+BACK, ELSEWHERE, A_BALL = 1, 2, 3
+
+
+def named(made: list[Picture], truths: list[np.ndarray]) -> list[np.ndarray]:
+    """Label maps of the wall with the pictures that the views look at, of a ball before it, and of the rest."""
+    found = []
+    for picture, depth in zip(made, truths):
+        empty = room(picture.view)[1]
+        y = (picture.view.pose[:3, 3] + pixel_directions(LENS) @ picture.view.pose[:3, :3].T * empty[..., None])[..., 1]
+        label = np.where(np.abs(y - HALF[1]) < 1e-6, BACK, ELSEWHERE)
+        found.append(np.where(depth < empty - 1e-6, A_BALL, label).astype(np.uint8))
+    return found
+
+
+def labelled(**what: bool) -> tuple[list[Picture], list[np.ndarray], list[np.ndarray], list[Wall], Known]:
+    """Pictures, true depths, label maps, all walls and what is known."""
+    made, truths = pictures(**what)
+    labels = named(made, truths)
+    points = known_points([p.view for p in made], [p.field for p in made], [p.sure for p in made], labels)
+    return made, truths, labels, walls(points, Reporter()), points
+
+
+def test_where_labels_tell_a_plain_wall_lies_on_its_plane() -> None:
+    made, truths, labels, found, points = labelled()
+    around = [[other for other in range(5) if other != number] for number in range(5)]
+    moved = on_walls(made, around, backdrops(points, found), [p.field for p in made], labels, Reporter())[2]
+    wall = made[2].plain & (labels[2] == BACK)
+    before, after = (np.abs(d / truths[2] - 1)[wall] for d in (made[2].field.depth, moved.depth))
+    assert (before > 0.05).mean() > 0.3
+    assert (after < 0.01).mean() > 0.9
+
+
+def test_where_labels_tell_a_plain_ball_stays_before_the_wall() -> None:
+    """Though nothing else does: no other views are asked."""
+    made, _, labels, found, points = labelled(ball=True, papered=True)
+    fields = [p.field for p in made]
+    assert (on_walls(made, [[]] * 5, found, fields, labels, Reporter())[2].depth != fields[2].depth).any()
+    told = on_walls(made, [[]] * 5, backdrops(points, found), fields, labels, Reporter())[2]
+    assert (told.depth == fields[2].depth).all()
+
+
+def test_a_backdrop_has_a_class_and_nothing_behind_it() -> None:
+    rng = np.random.default_rng(0)
+    front = np.stack([rng.uniform(-1, 1, 4000), np.zeros(4000), rng.uniform(-1, 1, 4000)], 1)
+    points = np.concatenate([front, front + [0, 1, 0]])
+    kind, footprint = np.repeat([5, 6], 4000).astype(np.uint8), np.full(8000, 0.01)
+    known = Known(points, np.tile([0.0, -1, 0], (8000, 1)), footprint, footprint, kind)
+    made = [Wall(np.array([0.0, y, 0]), np.array([0.0, -1, 0])) for y in (0.0, 1.0)]
+    (wall,) = backdrops(known, made)
+    assert wall.point[1] == 1
+    assert wall.classes is not None
+    assert np.flatnonzero(wall.classes).tolist() == [6]
+    assert backdrops(replace(known, kind=np.full(8000, VOID, np.uint8)), made) == []
 
 
 def test_without_plain_places_nothing_moves() -> None:

@@ -146,13 +146,15 @@ HANDLERS = (
 
 
 def register() -> None:
-    if not bpy.app.background:
-        for name, handler in HANDLERS:
-            getattr(bpy.app.handlers, name).append(handler)
+    for name, handler in _handlers():
+        getattr(bpy.app.handlers, name).append(handler)
 
 
 def unregister() -> None:
-    for name, handler in HANDLERS:
-        if handler in getattr(bpy.app.handlers, name):
-            getattr(bpy.app.handlers, name).remove(handler)
+    for name, handler in _handlers():
+        getattr(bpy.app.handlers, name).remove(handler)
     forget()
+
+
+def _handlers() -> tuple[tuple[str, Any], ...]:
+    return () if bpy.app.background else HANDLERS

@@ -38,11 +38,8 @@ STEEPEST = np.cos(np.radians(80))
 EDGE, EDGE_PIXELS = 0.03, 5.5  # share, or footprints of a pixel, by which the depth of neighbours differs at an outline
 NEIGHBOURS = 48  # views asked to confirm a depth: what lies at a picture's rim is seen by views that share little else
 CONFIRMED = 2  # of them that must
-AGREE, AGREE_PIXELS, ROUND_TRIP = (
-    0.01,
-    1.65,
-    1.5,
-)  # of the depth, or footprints of a pixel where photos are small; pixels
+# Of the depth, or footprints of a pixel where photos are small; pixels.
+AGREE, AGREE_PIXELS, ROUND_TRIP = 0.01, 1.65, 1.5
 OUTSIDE = -1.0  # depth of pixels beside the photo, which can confirm nothing
 HIDDEN = 0.03  # share of a place's distance by which what hides it is nearer
 BORDER = 33  # places along each side of a photo by which it is told where it ends

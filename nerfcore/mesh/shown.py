@@ -16,7 +16,7 @@ from .facelets import small_pieces
 from .photos import Photo
 from .visibility import PosedCamera, depth_buffer
 
-CUT = 0.005
+CUT = 0.005  # of a mesh's size, up to which a side of the region that lies closer has cut it; not tuned
 MOST_PHOTOS, ACROSS = 16, 48  # photos that are asked, evenly spread, and rays across each
 
 
